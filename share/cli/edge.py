@@ -114,15 +114,15 @@ def _open_map(stderr: Stderr, path: Path) -> MapStore:
     from share.store.map_store import MapStore
 
     store = MapStore.open(path)
-    map_state = store.opened_map()
-    for complaint in map_state.problems:
+    map_rows = store.rows().tables
+    for complaint in store.problems:
         stderr.print_line(f"map {path}: {complaint}")
     if not store.writable:
         stderr.print_line(
             f"map {path}: {store.read_only_reason}; it is used as it is, and nothing new is stored"
         )
     counts = (
-        f"{len(map_state.keyframes)} keyframes of {len(map_state.runs)} runs, {len(map_state.loops)} loops"
+        f"{len(map_rows['keyframe'])} keyframes of {len(map_rows['run'])} runs, {len(map_rows['loop'])} loops"
     )
     stderr.print_line(f"map {path}: {counts}")
     return store

@@ -9,8 +9,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from share.config import MergeConfig
 from share.mapping.agents.covariance_scales import inflate_covariance
 from share.mapping.agents.quarantine import Quarantine
@@ -45,7 +43,7 @@ class Atlas:
         self._runs = AgentRuns()
         self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self._runs)
         self.culling = KeyframeCulling(self.graph, self._runs)
-        self.quarantine = Quarantine(self.graph, self.loop_acceptance, known_views)
+        self.quarantine = Quarantine(self.graph, self.loop_acceptance)
 
     def __len__(self) -> int:
         return len(self.graph.poses)
@@ -81,10 +79,10 @@ class Atlas:
 
     def all_poses(self) -> SavePoses:
         """Current pose and map of every keyframe."""
-        nodes, poses = self.graph.odometry.nodes, self.graph.poses
-        maps = tuple(self.graph.map_id(node.segment) for node in nodes.values())
-        T_map_body = np.array([poses[n] for n in nodes]).reshape(-1, 4, 4)
-        return SavePoses(tuple(node.key for node in nodes.values()), T_map_body, maps)
+        graph, nodes = self.graph, self.graph.odometry.nodes
+        map_ids = {segment: graph.map_id(segment) for segment in graph.odometry.live_segments}
+        maps = tuple(map_ids[node.segment] for node in nodes.values())
+        return SavePoses(tuple(node.key for node in nodes.values()), graph.poses.stack(list(nodes)), maps)
 
     # Runs
 

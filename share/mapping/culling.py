@@ -11,75 +11,21 @@ none of its agents is present and it has keyframes of one name only.
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum, auto
 
 import numpy as np
 
-from share.geometry import se3
-from share.mapping.loop_consistency import PLACE_M, PLACE_RAD, articulation_segments
+from share.mapping.loop_consistency import articulation_segments
 from share.mapping.map_graph import MapGraph
+from share.mapping.redundancy import InSlices, redundant, run_at_once
 from share.mapping.segments import MIN_LOOP_GAP, AgentRuns
-from share.types import F64
 
 _MARGIN = 1.05  # share of the most keyframes at which those to remove are chosen
 _REMOVED_PER_KEYFRAME = 2
-_BLOCK_ROWS = 256
-_NO_NEIGHBOUR_DISTANCE = 1e9  # of a pose without others
-
-
-def redundant(
-    poses: F64, owners: Sequence[str | None], quotas: Counter[str], max_distance: float
-) -> list[int]:
-    """Select poses (N, 4, 4) to remove, by index, in order of removal.
-
-    Repeatedly takes one of the closest pair, the one whose second neighbour is nearer, while the pair is
-    closer than `max_distance`. Distance of two poses: |shift| / PLACE_M + angle / PLACE_RAD. owners: name of
-    each pose; None: must stay. quotas: removals of each name; counted down.
-    """
-    distance = _pairwise_distance(poses)
-    np.fill_diagonal(distance, np.inf)
-    names = np.array([name or "" for name in owners])
-    is_removable = np.array([name is not None and quotas[name] > 0 for name in owners], bool)
-    two_nearest = np.concatenate([_two_nearest(distance[rows]) for rows in _row_blocks(len(poses))])
-    out: list[int] = []
-    while is_removable.any():
-        rank = np.minimum(two_nearest[:, 0] + 1e-3 * two_nearest[:, 1], _NO_NEIGHBOUR_DISTANCE)
-        removed = int(np.where(is_removable, rank, np.inf).argmin())
-        if two_nearest[removed, 0] > max_distance:
-            break
-        out.append(removed)
-        is_removable[removed] = False
-        quotas[str(names[removed])] -= 1
-        if not quotas[str(names[removed])]:
-            is_removable[names == names[removed]] = False
-        stale = np.flatnonzero(distance[removed] <= two_nearest[:, 1])
-        distance[removed], distance[:, removed] = np.inf, np.inf
-        two_nearest[stale] = _two_nearest(distance[stale])
-    return out
-
-
-def _pairwise_distance(poses: F64) -> F64:
-    distance: F64 = np.empty((len(poses), len(poses)))
-    for rows in _row_blocks(len(poses)):
-        shift, angle = se3.pairwise_distances(poses[rows], poses)
-        distance[rows] = shift / PLACE_M + angle / PLACE_RAD
-    return distance
-
-
-def _row_blocks(count: int) -> list[slice]:
-    """Slices of rows: temporaries for all rows at once would take five times the result's memory."""
-    return [slice(k, k + _BLOCK_ROWS) for k in range(0, count, _BLOCK_ROWS)]
-
-
-def _two_nearest(distance: F64) -> F64:
-    """Two least distances of each row, (N, 2); inf where missing."""
-    if distance.shape[1] < 2:
-        return np.full((len(distance), 2), np.inf)
-    return np.partition(distance, 1, axis=1)[:, :2].copy()
-
-
+_COST_PER_KEYFRAME = 1000  # of choosing, in the unit of `InSlices`: 10 ms
 _ABSENT_AGENTS = ""  # not a valid name
 _SAME_PLACE_DISTANCE = 1.0  # in the measure of `redundant`
 
@@ -101,25 +47,44 @@ class KeyframeCulling:
     def __init__(self, graph: MapGraph, runs: AgentRuns) -> None:
         self._graph, self._runs = graph, runs
         self._due: list[int] = []
+        self._search: InSlices[list[int]] | None = None
         self._threshold = 0.0  # number of keyframes at which removable ones are searched for again
 
     def next_nodes(self, max_keyframes: int) -> list[int]:
-        """Nodes to remove when a keyframe arrives: two at most, since all at once would delay the others."""
+        """Nodes to remove when a keyframe arrives: two at most, since all at once would delay the others.
+
+        They are chosen in slices, one a call.
+        """
         count = len(self._graph.poses)
-        if not self._due and count > max(max_keyframes * _MARGIN, self._threshold):
-            self._due = self.choose(count - max_keyframes)
-            # Where no keyframe is removable, do not search for one each time.
-            self._threshold = 0.0 if self._due else count * _MARGIN
+        if self._search is None and not self._due and count > max(max_keyframes * _MARGIN, self._threshold):
+            self._search = self._choose(count - max_keyframes)
+        if self._search is not None:
+            self._continue_search(self._search)
         batch, self._due = self._due[:_REMOVED_PER_KEYFRAME], self._due[_REMOVED_PER_KEYFRAME:]
         return batch
+
+    def _continue_search(self, search: InSlices[list[int]]) -> None:
+        cost = 0
+        try:
+            while cost < _COST_PER_KEYFRAME:
+                cost += next(search)
+        except StopIteration as end:
+            self._search, self._due = None, end.value
+            # Where no keyframe is removable, do not search for one each time.
+            self._threshold = 0.0 if self._due else len(self._graph.poses) * _MARGIN
 
     def choose(self, count: int) -> list[int]:
         """Return up to `count` node ids to remove.
 
         If possible, absent runs keep their newest keyframes, and maps without a present agent keep something.
         """
+        return run_at_once(self._choose(count))
+
+    def _choose(self, count: int) -> InSlices[list[int]]:
+        chosen: list[int] = []
         for reserve in ReturnReserve:
-            if len(chosen := self._choose_with(count, reserve)) >= count:
+            chosen = yield from self._choose_with(count, reserve)
+            if len(chosen) >= count:
                 break
         return chosen
 
@@ -136,7 +101,7 @@ class KeyframeCulling:
             len(nodes) > 1 or segment not in articulation_segments(graph.loop_counts)
         )
 
-    def _choose_with(self, count: int, reserve: ReturnReserve) -> list[int]:
+    def _choose_with(self, count: int, reserve: ReturnReserve) -> InSlices[list[int]]:
         maps = self._segments_by_map()
         finished = [
             reference_segment
@@ -144,12 +109,14 @@ class KeyframeCulling:
             if self._is_finished(segments, reserve)
         ]
         ongoing = [reference_segment for reference_segment in maps if reference_segment not in set(finished)]
-        protected = self._protected(ongoing, reserve)
+        protected = yield from self._protected(ongoing, reserve)
         quotas, out = self._quotas(count, protected), dict[int, None]()
         for reference_segment in (*finished, *ongoing):
-            self._add_redundant(maps[reference_segment], protected, quotas, out, _SAME_PLACE_DISTANCE)
+            yield from self._add_redundant(
+                maps[reference_segment], protected, quotas, out, _SAME_PLACE_DISTANCE
+            )
         for reference_segment in (*reversed(finished), *ongoing):
-            self._add_redundant(maps[reference_segment], protected, quotas, out)
+            yield from self._add_redundant(maps[reference_segment], protected, quotas, out)
         return list(out)
 
     def _add_redundant(
@@ -159,20 +126,25 @@ class KeyframeCulling:
         quotas: Counter[str],
         removed: dict[int, None],
         max_distance: float = np.inf,
-    ) -> None:
+    ) -> InSlices[None]:
         """Add redundant nodes of one map to `removed`, within the quotas, closer than `max_distance`."""
-        graph = self._graph
-        node_ids = [n for s in segments for n in graph.odometry.segments[s].nodes if n not in removed]
-        owners = [None if n in protected else self._agent_name(n) for n in node_ids]
-        if any(name is not None and quotas[name] for name in owners):
-            poses = np.array([graph.poses[n] for n in node_ids])
-            chosen = redundant(poses, owners, quotas, max_distance)
-            removed |= dict.fromkeys(node_ids[i] for i in chosen)
+        if not any(quotas[self._segment_name(s)] for s in segments):
+            return
+        graph, node_ids, owners = self._graph, list[int](), list[str | None]()
+        for segment in segments:
+            name = self._segment_name(segment)
+            nodes = [n for n in graph.odometry.segments[segment].nodes if n not in removed]
+            node_ids += nodes
+            owners += [None if n in protected else name for n in nodes]
+        chosen = yield from redundant(graph.poses.stack(node_ids), owners, quotas, max_distance)
+        removed |= dict.fromkeys(node_ids[i] for i in chosen)
 
     def _quotas(self, count: int, protected: set[int]) -> Counter[str]:
         """How many keyframes each name gives."""
-        held_counts = Counter(map(self._agent_name, self._graph.poses))
-        removable = Counter(self._agent_name(n) for n in self._graph.poses if n not in protected)
+        held_counts = Counter[str]()
+        for segment in self._graph.odometry.live_segments:
+            held_counts[self._segment_name(segment)] += self._segment_size(segment)
+        removable = held_counts - Counter(self._agent_name(n) for n in protected if n in self._graph.poses)
         runs, presence_order = self._runs, self._runs.presence_order()
         absent_names = {name for name in held_counts if runs.is_name_absent(name)}
         fair_share = (
@@ -194,7 +166,7 @@ class KeyframeCulling:
         )
         return out + fair_quotas(held_counts, removable, out.pop(_ABSENT_AGENTS, 0), presence_order)
 
-    def _protected(self, reference_segments: Iterable[int], reserve: ReturnReserve) -> set[int]:
+    def _protected(self, reference_segments: Iterable[int], reserve: ReturnReserve) -> InSlices[set[int]]:
         """Nodes that must stay: the newest of each growing segment, the anchors of these maps, and a node of
         each segment that connects a map.
         """
@@ -204,8 +176,9 @@ class KeyframeCulling:
             if self._is_growing(segment, reserve):
                 out.update(odometry.segments[segment].nodes[-MIN_LOOP_GAP:])
         for segment in articulation_segments(graph.loop_counts):
-            nodes = odometry.segments[segment].nodes
-            out.add(max(nodes, key=lambda n: len(graph.edges.incident(n))))
+            if nodes := odometry.segments[segment].nodes:
+                out.add(max(nodes, key=graph.edges.degree))
+            yield len(nodes) // 16
         return out
 
     def _segments_by_map(self) -> dict[int, list[int]]:
@@ -232,6 +205,10 @@ class KeyframeCulling:
         is_gone = runs.is_superseded if reserve is ReturnReserve.NEWEST_AND_MAP else runs.is_absent
         return not is_gone(agent) and self._graph.odometry.current_segment(agent) == segment
 
+    def _segment_name(self, segment: int) -> str:
+        """Name of the agent of a segment."""
+        return self._runs.name(self._graph.odometry.segments[segment].agent)
+
     def _agent_name(self, node_id: int) -> str:
         return self._runs.name(self._graph.odometry.nodes[node_id].key.agent)
 
@@ -246,7 +223,11 @@ def fair_quotas(
     `AgentRuns.presence_order`.
     """
     out = Counter[str]()
+    heap = [(-counts[name], presence_order.get(name, -1), name) for name in counts if limits[name] > 0]
+    heapq.heapify(heap)
     for _ in range(min(count, limits.total())):
-        candidates = (name for name in counts if out[name] < limits[name])
-        out[max(candidates, key=lambda name: (counts[name] - out[name], -presence_order.get(name, -1)))] += 1
+        held, order, name = heapq.heappop(heap)
+        out[name] += 1
+        if out[name] < limits[name]:
+            heapq.heappush(heap, (held + 1, order, name))
     return out

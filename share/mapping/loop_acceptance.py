@@ -260,8 +260,7 @@ class LoopAcceptance:
         graph = self._graph
         maps = [graph.map_nodes(graph.reference_segment(key)) for key in (loop.a, loop.b)]
         known_places = min(
-            count_places(np.array([graph.poses[n] for n in nodes]), self._config.join_places + 1)
-            for nodes in maps
+            count_places(graph.poses.stack(nodes), self._config.join_places + 1) for nodes in maps
         )
         return max(1, known_places - 1)
 

@@ -20,6 +20,7 @@ from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.graph.solver import GraphUpdate
 from share.mapping.loops import KeyframeKey, Loop, RelativePose
+from share.mapping.pose_table import PoseTable
 from share.mapping.segments import OdometrySegments
 from share.types import F64, Keyframe
 
@@ -78,6 +79,10 @@ class GraphEdges:
         """Ids of the edges that end at a node, oldest first."""
         return sorted(self._incident.get(node_id, ()))
 
+    def degree(self, node_id: int) -> int:
+        """Number of edges that end at a node."""
+        return len(self._incident.get(node_id, ()))
+
     def mark_moved(self, node_ids: Iterable[int]) -> None:
         """Mark nodes whose poses differ from the solver's."""
         self._moved_nodes.update(node_ids)
@@ -90,14 +95,15 @@ class GraphEdges:
             self._sent_nodes.discard(node_id)
             self._removed_nodes.add(node_id)
 
-    def take_update(self, poses: Mapping[int, F64], gravity_factors: Mapping[int, F64]) -> GraphUpdate:
+    def take_update(self, poses: PoseTable, gravity_factors: Mapping[int, F64]) -> GraphUpdate:
         """Return all changes since the last call and count them as sent.
 
         poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
         """
         edges = [(n, self.by_id[n], n in self.loops or n in self.spans) for n in sorted(self._pending_edges)]
+        moved = sorted(self._moved_nodes)
         update = GraphUpdate.from_edges(
-            {node_id: poses[node_id] for node_id in sorted(self._moved_nodes)},
+            dict(zip(moved, poses.stack(moved), strict=True)),
             edges,
             sorted(self._removed_edges),
             sorted(self._removed_nodes),
@@ -141,7 +147,7 @@ class MapGraph:
     def __init__(self) -> None:
         self.odometry = OdometrySegments()
         self.edges = GraphEdges()
-        self.poses: dict[int, F64] = {}
+        self.poses = PoseTable()
         self.gravity_factors: dict[int, F64] = {}
         self.reference_segments: list[int] = []
         self.split_segments: set[int] = set()
@@ -255,8 +261,7 @@ class MapGraph:
     def move_map(self, reference_segment: int, T: F64) -> None:
         """Transform a whole map rigidly by T (4, 4) from the left."""
         node_ids = self.map_nodes(reference_segment)
-        moved = se3.orthonormal(T @ np.array([self.poses[n] for n in node_ids]))
-        self.poses.update(zip(node_ids, moved, strict=True))
+        self.poses.assign(node_ids, se3.orthonormal(T) @ self.poses.stack(node_ids))
         self.edges.mark_moved(node_ids)
 
     def rescale_odometry(self, agent: str, log_scale: float, covariance_scale: float) -> None:
@@ -371,9 +376,7 @@ class MapGraph:
         for goal, cov in zip(goals, covs, strict=True):
             if cov is None:
                 raise ValueError(f"nodes {a} and {goal} are not in one map")
-        return RelativePose(
-            se3.inverse(self.poses[a]) @ np.array([self.poses[n] for n in goals]), np.array(covs)
-        )
+        return RelativePose(se3.inverse(self.poses[a]) @ self.poses.stack(goals), np.array(covs))
 
     def segment_pair(self, edge: PoseEdge) -> tuple[int, int]:
         """The segments at an edge's ends, the older first."""

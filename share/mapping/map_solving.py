@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -163,7 +164,11 @@ class MapSolving:
         added = self._loop_acceptance.accept_fitting()
         waiting = self._update_gate(job, solution)
         corrections, failed = self._corrections(job)
-        loop_count = sum(n in graph.edges.loops for n in solution.loop_ids.tolist())
+        loop_count = sum(
+            count
+            for (segment, _), count in graph.loop_counts.items()
+            if graph.reference_segments[segment] == reference_segment
+        )
         counts = f"{len(solution.pose_ids)} poses, {loop_count} loops solved"
         reason = f"map {job.map_id}: {counts}, corrections for {', '.join(corrections) or 'no agent'}"
         reason += "".join(f"; {agent}: {cause}" for agent, cause in failed.items())
@@ -173,11 +178,10 @@ class MapSolving:
 
     def _apply_poses(self, job: SolveJob, solution: GraphSolution) -> None:
         graph = self._graph
-        for node_id, T in zip(solution.pose_ids.tolist(), solution.poses, strict=True):
-            if node_id in graph.poses:
-                graph.poses[node_id] = T
+        graph.poses.assign(solution.pose_ids, solution.poses)
         for segment, last in zip(job.segments, job.newest_nodes, strict=True):
-            graph.propagate(n for n in graph.odometry.segments[segment].nodes if n > last)
+            nodes = graph.odometry.segments[segment].nodes
+            graph.propagate(nodes[bisect_right(nodes, last) :])
 
     def _update_gate(self, job: SolveJob, solution: GraphSolution) -> dict[str, float]:
         """Pass the new covariances to the localisation gate. Return the sigma (m) of agents that wait."""

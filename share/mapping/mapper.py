@@ -21,16 +21,24 @@ from share.mapping.atlas import Atlas
 from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, StoredMap
+from share.mapping.map_changes import (
+    MapChange,
+    RemoveLoops,
+    SaveLoop,
+    SavePoses,
+    SaveView,
+    StoredMap,
+)
 from share.mapping.map_solving import AppliedSolution
 from share.mapping.mapper_counters import MapperCounters
 from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, rank_candidates, service_kind
-from share.mapping.recognition.keyframe_views import KeyframeViews
+from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeArchive, KeyframeViews
 from share.mapping.recognition.nearby import nearby_candidates
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import (
     AlignStep,
     DescribeStep,
+    IndexStep,
     Job,
     LookupStep,
     QueryStep,
@@ -50,10 +58,11 @@ _RETRY_INTERVAL = 4  # nodes of every fourth id are compared with those of agent
 class Mapper:
     """The maps of all agents. `agent` always names one run of an agent."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, archive: KeyframeArchive | None = None) -> None:
+        """archive: images and views of the keyframes, where a map file keeps them."""
         self._config = config
         self._hellos: dict[str, Hello] = {}
-        self._views = KeyframeViews()
+        self._views = KeyframeViews(archive)
         self.atlas = Atlas(config.merge, self._views.by_node)
         self._queries = QueryQueue(config.edge)
         self._merge_gate = MergeGate(config.control, config.edge.policy)
@@ -99,7 +108,7 @@ class Mapper:
         self._changes += [] if link is None else [link]
         hello = self._hellos[agent]
         node_id = self.atlas.add_keyframe(agent, keyframe, map_rank(self._config, hello))
-        self._views.add(node_id, keyframe, hello.rig)
+        self._views.add(node_id, self.atlas.key(node_id), keyframe, hello.rig)
         self._queries.add(agent, service_kind(self._config, hello), node_id, is_extra)
         events = []
         if keyframe.reference < 0 or (link is not None and link.reference < 0):
@@ -111,7 +120,6 @@ class Mapper:
 
     def remove_keyframes(self, node_ids: Sequence[int]) -> None:
         """Remove keyframes, except those that have to stay."""
-        self._views.index_restored()
         removed = self.atlas.remove_keyframes(node_ids)
         for keyframe in removed:
             self._views.remove(keyframe.node_id)
@@ -125,7 +133,7 @@ class Mapper:
         """Restore the map of an earlier session, before anything else is added.
 
         Restored maps keep their reference segments, also before headsets that come now. Their views are
-        indexed at the first look-up.
+        indexed beside look-ups.
         """
         for run in kept.runs:
             self.add_run(run.run_key, run.hello, run.credential)
@@ -136,8 +144,11 @@ class Mapper:
             map_rank(self._config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
             for name in kept.segments
         ]
-        for node_id, stored in zip(self.atlas.restore(kept, ranks), kept.keyframes, strict=True):
-            self._views.add_restored(node_id, stored.keyframe, hellos[stored.run_key].rig)
+        restored = list(zip(self.atlas.restore(kept, ranks), kept.keyframes, strict=True))
+        self._views.restore(
+            [(n, one.keyframe_key, one.keyframe, hellos[one.run_key].rig) for n, one in restored]
+        )
+        for stored in kept.keyframes:
             self._counters.runs[stored.run_key].newest_id = stored.keyframe.id
 
     # Steps: what to do next, and what follows from the result
@@ -146,7 +157,6 @@ class Mapper:
         """Next step of looking up a keyframe; None if there is none or one is running."""
         if self._lookup.is_running:
             return None
-        self._views.index_restored()
         while (step := self._lookup.next_step()) is None:
             if (job := self._next_job()) is None:
                 return None
@@ -158,6 +168,8 @@ class Mapper:
         while (node_id := self._next_query()) is not None:
             if node_id in self._views.by_node:
                 return self._look_up(node_id)
+        if entries := self._views.next_restored():
+            return self._index(entries)
         node_id = self._views.next_undescribed()
         return None if node_id is None else self._describe(node_id)
 
@@ -206,11 +218,18 @@ class Mapper:
 
     def _look_up(self, node_id: int) -> Job:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
+        if entries := self._views.next_restored():
+            yield from self._index(entries)
         yield from self._describe(node_id)
         is_aligned = yield from self._align_nearby(node_id)
         if is_aligned and len(self.atlas.map_sizes()) == 1 and node_id % _RECHECK_INTERVAL:
             return  # the map is right here, and there is no other to find
         yield from self._query(node_id)
+
+    def _index(self, entries: Sequence[IndexEntry]) -> Job:
+        """Index restored keyframes."""
+        self._views.index_words((yield IndexStep(entries[0].node_id, self._views.index, entries)))
+        yield []
 
     def _describe(self, node_id: int) -> Job:
         """Find the ORB features of a keyframe that came as an image only."""
@@ -221,7 +240,8 @@ class Mapper:
         except Exception:
             self._views.describe(node_id, View.empty())  # else it would be tried for ever
             raise
-        self._views.describe(node_id, view)
+        if (packed := self._views.describe(node_id, view)) is not None and len(packed):
+            self._changes.append(SaveView(self.atlas.key(node_id), packed))
         yield []
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from share.metrics.frame_log import summary
 
-STEP_KINDS = "describe", "place", "verify", "align", "solve"
+STEP_KINDS = "describe", "index", "place", "verify", "align", "solve"
 _MAX_STEP_TIMES = 5000  # newest durations of each kind of step in a report
 
 

@@ -30,6 +30,8 @@ _NEAR_M = 1.0
 _NEAR_RAD = 0.5
 _MIN_POINTS = 20  # visible in a pair of views; below, the pair is not informative
 _MAX_PAIRS = 40  # compared before a merge
+_MAX_COMPARED = 500  # nodes of a map for which the nearest nodes of the other are searched for
+_NEIGHBOURS = 16  # nearest of those
 _PROBATION_VIEWS = 40  # compared after a merge; probation ends then if the CUSUM is zero
 # A pair that moved by less is not compared again.
 _SAME_M = 0.02
@@ -67,10 +69,11 @@ class OverlapCheck:
         """
         graph, (a, b) = self._graph, self._graph.loop_nodes(loop)
         nodes_a, nodes_b = (self._with_views(self._nodes_on_side(n, graph.is_same_map(a, b))) for n in (a, b))
+        nodes_b = nodes_b[:: 1 + len(nodes_b) // _MAX_COMPARED]  # evenly, of many
         if not nodes_a or not nodes_b:
             return []
         T_b = graph.poses[a] @ loop.T_a_b @ se3.inverse(graph.poses[b])  # map of b in that of a
-        poses_a, poses_b = (np.array([graph.poses[n] for n in nodes]) for nodes in (nodes_a, nodes_b))
+        poses_a, poses_b = (graph.poses.stack(nodes) for nodes in (nodes_a, nodes_b))
         pairs = _near_pairs(poses_a, T_b @ poses_b)
         comparisons = ((j, self._compare_views(nodes_a[i], nodes_b[j], T)) for i, j, T in pairs)
         return [comparison for _, comparison in sorted(_informative(comparisons, _MAX_PAIRS))]
@@ -119,7 +122,7 @@ class OverlapCheck:
         if not nodes or node_id not in self._camera_views:
             return None
         poses = self._graph.poses
-        pairs = _near_pairs(np.array([poses[n] for n in nodes]), poses[node_id][None])
+        pairs = _near_pairs(poses.stack(nodes), poses[node_id][None])
         comparisons = _informative(((j, self._compare_views(nodes[i], node_id, T)) for i, j, T in pairs), 1)
         return comparisons[0][1] if comparisons else None
 
@@ -158,16 +161,20 @@ def _informative(
 def _near_pairs(poses_a: F64, poses_b: F64) -> Iterator[tuple[int, int, F64]]:
     """Yield pairs of poses a (N, 4, 4), b (K, 4, 4) from about one spot as i, j, T_a_b.
 
-    Nearest first, each pose in at most one pair.
+    Nearest first, each pose in at most one pair. Of each b the `_NEIGHBOURS` nearest poses a are considered.
     """
-    a, b = poses_a[:, :3, 3], poses_b[:, :3, 3]
-    square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
-    rows, cols = np.nonzero(square < _NEAR_M**2)
+    count = min(_NEIGHBOURS, len(poses_a))
+    distance, rows = KDTree(poses_a[:, :3, 3]).query(
+        poses_b[:, :3, 3], np.arange(1, count + 1), distance_upper_bound=_NEAR_M
+    )
+    is_near = np.isfinite(distance)
+    cols = np.nonzero(is_near)[0]
+    distance, rows = distance[is_near], rows[is_near]
     cosine = ((poses_a[rows, :3, :3] * poses_b[cols, :3, :3]).sum((1, 2)) - 1) / 2
     is_similar = cosine > np.cos(_NEAR_RAD)
-    rows, cols = rows[is_similar], cols[is_similar]
+    distance, rows, cols = distance[is_similar], rows[is_similar], cols[is_similar]
     used_a, used_b = set[int](), set[int]()
-    for k in np.argsort(square[rows, cols], kind="stable"):
+    for k in np.argsort(distance, kind="stable"):
         i, j = int(rows[k]), int(cols[k])
         if i not in used_a and j not in used_b:
             used_a.add(i)

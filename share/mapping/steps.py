@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
-from share.mapping.recognition.index import PlaceCandidate, PlaceIndex
+from share.mapping.recognition.index import U32, PlaceCandidate, PlaceIndex
+from share.mapping.recognition.keyframe_views import IndexEntry
 from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_verified
 from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
 from share.types import F64, View
@@ -25,6 +26,19 @@ class DescribeStep:
 
     def run(self) -> View:
         return self.image.describe()
+
+
+@dataclass(frozen=True, eq=False)
+class IndexStep:
+    """Hash the descriptors of restored keyframes: words of each."""
+
+    node_id: int  # one of them
+    index: PlaceIndex
+    entries: Sequence[IndexEntry]
+    kind: str = "index"
+
+    def run(self) -> dict[int, U32]:
+        return {node_id: self.index.words(descriptors) for node_id, descriptors in self.entries}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +107,7 @@ class SolveStep:
         return solver.solve(self.job.anchor, self.job.covariance_nodes)
 
 
-LookupStep = DescribeStep | QueryStep | VerifyStep | AlignStep
+LookupStep = DescribeStep | IndexStep | QueryStep | VerifyStep | AlignStep
 Step = LookupStep | SolveStep
 
 # Yields in turn a step, whose result or exception it is sent, and the events that follow from it.

@@ -22,7 +22,6 @@ from typing import Any
 from share.config import Config
 from share.errors import StoreError
 from share.event_kinds import EventKind
-from share.mapping.map_changes import StoredMap
 from share.net.transport import EdgeLink
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
@@ -204,7 +203,7 @@ class EdgeRun:
         }
         self._reported_s = now
 
-    def _load_stored_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
+    def _load_stored_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
         """Return the map and the agents' runs to start with. Raises StoreError if the map file is
         unreadable."""
         if POLICIES[self._settings.edge.policy].streams_frames:
@@ -212,7 +211,7 @@ class EdgeRun:
         return self._restarts.load_map()
 
     def _start_session(
-        self, loaded: tuple[StoredMap | None, list[RestoredRun]], start_delay_s: float = 0.0
+        self, loaded: tuple[RestoreMap | None, list[RestoredRun]], start_delay_s: float = 0.0
     ) -> None:
         """Start a new session: agents see its new number and resend what the map lacks.
 
@@ -231,16 +230,16 @@ class EdgeRun:
             self._start_mapping(*loaded, start_delay_s)
 
     def _start_mapping(
-        self, stored_map: StoredMap | None, known: list[RestoredRun], start_delay_s: float
+        self, restore: RestoreMap | None, known: list[RestoredRun], start_delay_s: float
     ) -> None:
         store, writable = self._restarts.store, self._restarts.writable
         self._state_machine = Edge(self._settings, secrets.randbits(63), writable, known, self._start_ns)
-        arguments = (self._settings,)
+        arguments = (self._settings, None if store is None else store.path)
         self._mapper_process = WorkerProcess(
             "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
         )
-        if stored_map is not None:
-            self._mapper_process.send(RestoreMap(stored_map))
+        if restore is not None:
+            self._mapper_process.send(restore)
         if store is not None and writable:
             self._map_writer = MapWriter(store, self._post, self._post_map_notice)
 

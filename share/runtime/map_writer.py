@@ -91,6 +91,7 @@ class MapWriter:
         """Write the next batch. Return False if the file cannot be written."""
         if self._failure is not None:
             self._pending = newest_poses_only(self._pending)
+        known_problems = self._store.problems
         batch = [self._pending[i] for i in range(min(max_requests, len(self._pending)))]
         try:
             self._store.write([change for keep in batch for change in keep.changes])
@@ -101,6 +102,8 @@ class MapWriter:
             if len(batch) > 1:
                 return self._write(max_requests=1)
             self._notify(f"a change cannot be saved and is skipped: {type(error).__name__}: {error}")
+        for problem in self._store.problems[len(known_problems) :]:
+            self._notify(problem)
         for _ in batch:
             self._pending.popleft()
         if self._failure is not None:

@@ -7,18 +7,22 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from share.config import Config
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
-from share.mapping.map_changes import StoredMap
+from share.mapping.map_changes import StoredMap, with_unknown_credentials
 from share.mapping.mapper import Mapper
 from share.mapping.steps import SolveStep
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
 from share.protocol.keyframe_intake import FairQueue
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 from share.startup import HeapTrimmer
+from share.store.keyframe_archive import KeyframeArchive
+from share.store.loading import decode_map
+from share.store.salvage import ReadRows
 from share.timing import Backoff
 
 T = TypeVar("T")
@@ -29,9 +33,19 @@ _SAVE_POSES_S = 5.0  # period of saving all poses
 
 @dataclass(frozen=True, eq=False)
 class RestoreMap:
-    """First message to the mapper: the map of an earlier session."""
+    """First message to the mapper: the map of an earlier session, as rows of its file.
 
-    stored_map: StoredMap
+    has_keys: agents of this edge have keys.
+    """
+
+    rows: ReadRows
+    has_keys: bool = False
+
+    @property
+    def stored_map(self) -> StoredMap:
+        """Decoding takes seconds for a large map, so the mapper does it."""
+        decoded = decode_map(self.rows.copy())
+        return with_unknown_credentials(decoded) if self.has_keys else decoded
 
 
 @dataclass(frozen=True)
@@ -67,16 +81,25 @@ class _SolveResult:
     ms: float
 
 
-def run_mapper(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
+def run_mapper(
+    inbox: Inbox, answer: Callable[[Any], None], settings: Config, map_file: Path | None = None
+) -> None:
     """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe and
-    DropRun until END; answers MapperResult, MapperReport, MapRestored and SolverDied."""
-    _MapperProcess(inbox, answer, settings).run()
+    DropRun until END; answers MapperResult, MapperReport, MapRestored and SolverDied. map_file: where images
+    and views are read."""
+    _MapperProcess(inbox, answer, settings, None if map_file is None else KeyframeArchive(map_file)).run()
 
 
 class _MapperProcess:
-    def __init__(self, inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
+    def __init__(
+        self,
+        inbox: Inbox,
+        answer: Callable[[Any], None],
+        settings: Config,
+        archive: KeyframeArchive | None,
+    ) -> None:
         self._inbox, self._answer, self._settings = inbox, answer, settings
-        self._mapper = Mapper(settings)
+        self._mapper = Mapper(settings, archive)
         self._backoff = Backoff(time.monotonic_ns())
         self._solver = self._new_solver(0.0)
         self._is_restoring = False

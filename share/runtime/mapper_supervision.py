@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from share.errors import ShareError
-from share.mapping.map_changes import StoredMap, with_unknown_credentials
+from share.mapping.map_changes import with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
-from share.runtime.mapper_process import MapperReport
+from share.runtime.mapper_process import MapperReport, RestoreMap
 from share.store.map_store import MapStore
 from share.timing import Backoff
 
@@ -48,24 +48,25 @@ class MapperRestarts:
         self._tries += self._is_restoring
         return self._backoff.record_failure(time.monotonic_ns())
 
-    def load_map(self) -> tuple[StoredMap | None, list[RestoredRun]]:
-        """Return the map and the agents' runs for a new session. Raises StoreError if the file is unreadable
-        now."""
+    def load_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
+        """Return the map for the mapper, and the agents' runs for a new session. Raises StoreError if the
+        file is unreadable now."""
         self._is_restoring = False
         if self._tries >= _MAX_TRIES:
             self._set_aside(f"{self._tries} mappers in a row have died while restoring it")
         if self.store is None:
             return None, []
         try:
-            stored_map = with_unknown_credentials(self.store.load()) if self._has_keys else self.store.load()
-            known = restored_runs(stored_map, self._known_m)
+            restore, outline = RestoreMap(self.store.rows(), self._has_keys), self.store.outline()
+            outline = with_unknown_credentials(outline) if self._has_keys else outline
+            known = restored_runs(outline, self._known_m)
         except ShareError:
             raise
         except Exception as error:  # no content of a file may end the edge
             self._set_aside(f"{type(error).__name__}: {error}")
             return None, []
-        self._is_restoring = bool(stored_map.keyframes)
-        return stored_map, known
+        self._is_restoring = bool(restore.rows.tables["keyframe"])
+        return restore, known
 
     def _set_aside(self, reason: str) -> None:
         self._tries = 0

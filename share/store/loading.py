@@ -34,40 +34,57 @@ _ABOUT_LOST = "rows about the file and the credentials of runs could not be read
 _SOLUTIONS_LOST = "solutions could not be read: keyframes are placed by odometry and loops"
 
 
-def load_and_repair(path: Path) -> StoredMap:
-    """Read a whole map file before it is opened for writing; salvage it if needed."""
+@dataclass(frozen=True, eq=False)
+class OpenedMap:
+    """A map file as it was read: its rows, without images and views, and what is missing, a line each."""
+
+    rows: ReadRows
+    problems: tuple[str, ...] = ()
+
+
+def read_and_repair(path: Path) -> OpenedMap:
+    """Read a map file before it is opened for writing; salvage it if needed."""
     finish_salvage(path)
     if not database.check_is_map(path):
-        return StoredMap()
+        return OpenedMap(ReadRows.empty())
     try:
-        return _load_intact(path)
+        return _opened(_read_intact(path))
     except DamageError:
         salvaged, renamed = salvage(path)
-        return _with_complaint(
-            decode_map(salvaged),
-            f"the file was damaged; it is kept as {renamed.name}, and its intact rows were taken over",
-        )
+        problems = _with_complaint(decode_map(salvaged), damage_text(renamed)).problems
+        return OpenedMap(_read_intact(path), problems)
 
 
-def load_read_only(path: Path) -> StoredMap:
-    """Read a whole map file without changing it."""
+def damage_text(renamed: Path) -> str:
+    """What happened to a damaged file, which has another name now."""
+    return f"the file was damaged; it is kept as {renamed.name}, and its intact rows were taken over"
+
+
+def read_only(path: Path) -> OpenedMap:
+    """Read a map file without changing it."""
     if not database.check_is_map(path):
         raise UsageError(f"{path}: contains no map")
     try:
-        return _load_intact(path)
+        return _opened(_read_intact(path))
     except DamageError:
-        salvaged = decode_map(merge_run_copies(read_damaged(path)))
-        return _with_complaint(salvaged, "the file is damaged; only intact rows were read")
+        salvaged = merge_run_copies(read_damaged(path))
+        complaint = "the file is damaged; only intact rows were read"
+        return OpenedMap(salvaged, _with_complaint(decode_map(salvaged.copy()), complaint).problems)
+
+
+def _opened(read_rows: ReadRows) -> OpenedMap:
+    return OpenedMap(read_rows, outline_map(read_rows).problems)
 
 
 def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
     """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables."""
     with translate_errors(path, "opened"):
         connection = database.open_for_writing(path, durable)
+        connection.execute("BEGIN IMMEDIATE")
         if schema.is_empty(connection):
-            connection.execute("BEGIN IMMEDIATE")
             schema.create(connection)
-            connection.execute("COMMIT")
+        schema.convert(connection)
+        connection.execute("COMMIT")
     return connection
 
 
@@ -79,30 +96,40 @@ def _check_schema(path: Path) -> None:
         version = schema.read_version(connection)
     if version is None:
         raise DamageError(f"{path}: the map is damaged: its schema number is unreadable")
-    if version != schema.SCHEMA:
-        age = "a newer" if version > schema.SCHEMA else "an older"
+    if version > schema.SCHEMA:
         raise UsageError(
-            f"{path}: was made by {age} SHARE (schema {version}, this one reads {schema.SCHEMA}); "
+            f"{path}: was made by a newer SHARE (schema {version}, this one reads {schema.SCHEMA}); "
             "use that SHARE, or give another file"
+        )
+    if version < schema.OLDEST_SCHEMA:
+        raise UsageError(
+            f"{path}: was made before SHARE 0.1.0 (schema {version}), and no release reads it; "
+            "give another file: the agents build the map anew"
         )
 
 
-def _load_intact(path: Path) -> StoredMap:
-    """Read the map. Raises DamageError if any part is damaged, UsageError for another schema."""
+def _read_intact(path: Path) -> ReadRows:
+    """Read all but `schema.LARGE_TABLES`. Raises DamageError if any part of it is damaged, UsageError for
+    another schema.
+
+    Large tables are most of the file: their rows are checked when they are read (`KeyframeArchive`), and a
+    write that finds one damaged repairs the file (`MapStore.write`)."""
     _check_schema(path)
     database.check_header(path)
     with translate_errors(path, "read"), contextlib.closing(database.open_for_reading(path)) as connection:
         if schema.is_empty(connection):
-            return StoredMap()
+            return ReadRows.empty()
         if not schema.matches_schema(connection):
             raise DamageError(f"{path}: the map is damaged: its tables")
-        (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
-        if verdict != "ok":
-            raise DamageError(f"{path}: the map is damaged: {verdict}")
-        read_rows = read_intact_rows(connection)
+        tables = schema.own_tables(connection) - {*schema.LARGE_TABLES}
+        for table in sorted(tables):
+            (verdict,) = connection.execute(f"PRAGMA integrity_check({table})").fetchone()
+            if verdict != "ok":
+                raise DamageError(f"{path}: the map is damaged: {verdict}")
+        read_rows = read_intact_rows(connection, [table for table in rows.COLUMNS if table in tables])
     if read_rows.is_damaged:
         raise DamageError(f"{path}: the map is damaged: its rows")
-    return decode_map(read_rows)
+    return read_rows
 
 
 def _with_complaint(loaded: StoredMap, complaint: str) -> StoredMap:
@@ -111,6 +138,45 @@ def _with_complaint(loaded: StoredMap, complaint: str) -> StoredMap:
 
 
 # ---- Rows to values
+
+
+def outline_map(read_rows: ReadRows) -> StoredMap:
+    """Decode what the runs continue from: of the keyframes the newest of each run, and those without a pose.
+
+    Decoding all keyframes takes seconds for 20,000. Where a row cannot be decoded, all are, so that
+    `problems` says what is lost. Raises StoreError for another wire version.
+    """
+    try:
+        return _outline(read_rows)
+    except (ValueError, KeyError, WireError, StoreError):
+        return decode_map(read_rows.copy())
+
+
+def _outline(read_rows: ReadRows) -> StoredMap:
+    tables = {table: [row for _, row in numbered] for table, numbered in read_rows.tables.items()}
+    credentials = rows.read_credentials(read_rows.tables["about"])
+    runs = {row[0]: rows.read_run(row) for row in tables["run"]}
+    keys = {KeyframeKey(*row[:2]) for row in tables["keyframe"]}
+    newest = {row[0]: row[1] for row in tables["keyframe"]}
+    solved = next((_present_poses(rows.read_poses(row), keys) for row in tables["poses"]), None)
+    posed = set() if solved is None else set(solved.keys)
+    keyframes = tuple(
+        rows.read_keyframe(row)
+        for row in tables["keyframe"]
+        if newest[row[0]] == row[1] or row[:2] not in posed
+    )
+    chosen = {runs[keyframe.run_key].run_key: keyframe for keyframe in keyframes}  # KeyError without its run
+    links = [rows.read_link(row) for row in tables["link"] if row[0] in chosen and row[:2] not in posed]
+    next_ids = {row[0]: row[1] for row in tables["run"]}
+    return StoredMap(
+        tuple(replace(run, credential=credentials.get(key, "")) for key, run in runs.items()),
+        (),
+        keyframes,
+        {link.key: link for link in links},
+        tuple(rows.read_loop(row) for row in tables["loop"]),
+        solved,
+        {key: max(next_ids[key], newest.get(key, -1) + 1) for key in runs},
+    )
 
 
 def decode_map(read_rows: ReadRows) -> StoredMap:

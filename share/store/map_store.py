@@ -7,6 +7,7 @@ import contextlib
 import os
 import sqlite3
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,22 @@ from share.mapping.map_changes import (
     SaveLoop,
     SavePoses,
     SaveRun,
+    SaveView,
     StoredMap,
 )
-from share.store import database, rows
-from share.store.database import is_map, why_not_written
-from share.store.loading import decode_map, load_and_repair, load_read_only, open_writer
+from share.store import database, rows, schema
+from share.store.database import DamageError, is_map, why_not_written
+from share.store.loading import (
+    OpenedMap,
+    damage_text,
+    decode_map,
+    open_writer,
+    outline_map,
+    read_and_repair,
+    read_only,
+)
 from share.store.rows import COLUMNS, insert
-from share.store.salvage import read_intact_rows, set_aside
+from share.store.salvage import ReadRows, read_intact_rows, salvage, set_aside
 
 __all__ = ["MapStore", "is_map"]
 
@@ -38,12 +48,13 @@ __all__ = ["MapStore", "is_map"]
 class MapStore:
     """A map file, opened by `MapStore.open` or `MapStore.read`. Not thread-safe.
 
-    writable: `write` can be called. read_only_reason: why not.
+    writable: `write` can be called. read_only_reason: why not. problems: what was missing when it was opened,
+    a line each.
     """
 
-    def __init__(self, path: Path, loaded_map: StoredMap, reason: str) -> None:
-        self.path, self.read_only_reason = path, reason
-        self._loaded_map: StoredMap | None = loaded_map
+    def __init__(self, path: Path, opened: OpenedMap, reason: str) -> None:
+        self.path, self.read_only_reason, self.problems = path, reason, opened.problems
+        self._opened: ReadRows | None = opened.rows  # None: outdated
         self._db: sqlite3.Connection | None = None
         self._file_ids: dict[Path, tuple[int, int]] = {}  # device and inode of the map's files
         self._lock: int | None = None
@@ -55,7 +66,7 @@ class MapStore:
 
     @staticmethod
     def open(path: Path, durable: bool = False) -> MapStore:
-        """Open the map at `path`, or create it; all of it is read and checked.
+        """Open the map at `path`, or create it; all of it but images and views is read and checked.
 
         Of a damaged file all intact rows are taken over, and it is kept as FILE.damaged-N. A file that may
         not be written is opened for reading. durable: commits wait for the disk, so that a power failure
@@ -72,7 +83,7 @@ class MapStore:
             return MapStore.read(path, reason)
         lock = database.lock_map(path)
         try:
-            store = MapStore(path, load_and_repair(path), "")
+            store = MapStore(path, read_and_repair(path), "")
             store._db, store._lock = open_writer(path, durable), lock
             store._file_ids, store._durable = _read_file_ids(path), durable
             return store
@@ -83,16 +94,24 @@ class MapStore:
     @staticmethod
     def read(path: Path, reason: str = "it was opened for reading") -> MapStore:
         """Open a map for reading; an edge may use it at the same time. Raises UsageError, ShareError."""
-        return MapStore(path, load_read_only(path), reason)
+        return MapStore(path, read_only(path), reason)
 
     def write(self, new_changes: Sequence[MapChange]) -> None:
         """Write all changes or none. After the return they survive any end of this process.
 
-        Raises StoreError if the disk is full or fails: then none is written, and the call may be repeated.
+        A file that turns out to be damaged is repaired first, as by `open`. Raises StoreError if the disk is
+        full or fails: then none is written, and the call may be repeated.
         """
+        try:
+            self._write(new_changes)
+        except DamageError:
+            self._repair()
+            self._write(new_changes)
+
+    def _write(self, new_changes: Sequence[MapChange]) -> None:
         db = self._writable_db()
         self._check_in_place()
-        self._loaded_map = None  # outdated
+        self._opened = None
         try:
             db.execute("BEGIN IMMEDIATE")
             for change in new_changes:
@@ -102,23 +121,40 @@ class MapStore:
             with contextlib.suppress(sqlite3.Error):  # on a full disk SQLite has rolled back by itself
                 db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
+                kind = DamageError if database.is_damage(error) else StoreError
                 why = why_not_written(error, self.path)
-                raise StoreError(f"{self.path}: the map cannot be written: {why}") from None
+                raise kind(f"{self.path}: the map cannot be written: {why}") from None
             raise
         self._check_in_place()
 
-    def opened_map(self) -> StoredMap:
-        """Return the map as `open` read it; call before `write` and `load`."""
-        return StoredMap() if self._loaded_map is None else self._loaded_map
+    def _repair(self) -> None:
+        """Salvage the file. Not all of it is read when it is opened, so it may be damaged unnoticed."""
+        self._writable_db().close()
+        try:
+            renamed = salvage(self.path)[1]
+            self.problems = (*self.problems, damage_text(renamed))
+        finally:
+            self._opened = None
+            self._db = open_writer(self.path, self._durable)
+            self._file_ids = _read_file_ids(self.path)
+
+    def outline(self) -> StoredMap:
+        """Return what runs continue from (`outline_map`). Raises StoreError."""
+        return outline_map(self.rows())
 
     def load(self) -> StoredMap:
-        """Return the whole map; the first call returns what `open` read. Raises StoreError."""
-        loaded, self._loaded_map = self._loaded_map, None
-        if loaded is not None:
-            return loaded
+        """Return the whole map, but images and views of schema 5 (`KeyframeArchive`). Raises StoreError."""
+        loaded = decode_map(self.rows().copy())
+        return replace(loaded, problems=self.problems or loaded.problems)
+
+    def rows(self) -> ReadRows:
+        """Return all rows but images and views: as `open` read them, or read again after a `write`. Raises
+        StoreError."""
+        if self._opened is not None:
+            return self._opened
         if self._db is None:
-            return load_read_only(self.path)
-        return decode_map(read_intact_rows(self._db))
+            return read_only(self.path).rows
+        return read_intact_rows(self._db, [t for t in COLUMNS if t not in schema.LARGE_TABLES])
 
     def set_aside(self) -> Path:
         """Rename the map and start an empty one in its place. Return the new name of the old one.
@@ -129,7 +165,7 @@ class MapStore:
         try:
             return set_aside(self.path)
         finally:
-            self._loaded_map = None
+            self._opened = None
             self._db = open_writer(self.path, self._durable)
             self._file_ids = _read_file_ids(self.path)
 
@@ -187,7 +223,7 @@ def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
 
 _RUN_COLUMNS = (
     *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
-    *(("loop", "a_run"), ("loop", "b_run")),
+    *(("loop", "a_run"), ("loop", "b_run"), ("image", "run"), ("view", "run")),
 )
 
 
@@ -203,6 +239,8 @@ def apply_change(db: sqlite3.Connection, change: MapChange) -> None:
         case SaveLink():
             _delete_row(db, "link", change.key)
             insert(db, "link", rows.link_row(change))
+        case SaveView():
+            _insert_view(db, change)
         case SaveLoop():
             _insert_loop(db, change)
         case RemoveLoops(a, b):
@@ -240,6 +278,14 @@ def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe) -> None:
         return
     segment, ordinal = _segment_and_ordinal(db, change.run_key, starts_segment=change.keyframe.reference < 0)
     insert(db, "keyframe", rows.keyframe_row(change, segment, ordinal))
+    if len(jpeg := change.keyframe.image.jpeg):
+        insert(db, "image", rows.image_row(change.keyframe_key, jpeg))
+
+
+def _insert_view(db: sqlite3.Connection, change: SaveView) -> None:
+    _delete_row(db, "view", change.key)
+    if _first_row(db, "SELECT 1 FROM keyframe WHERE run = ? AND id = ?", *change.key):
+        insert(db, "view", rows.view_row(change))
 
 
 def _segment_and_ordinal(db: sqlite3.Connection, run: str, starts_segment: bool) -> tuple[int, int]:
@@ -271,7 +317,7 @@ def _insert_loop(db: sqlite3.Connection, change: SaveLoop) -> None:
 
 def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
     next_id = _next_id(db, key.agent)
-    for table in ("keyframe", "link"):
+    for table in ("keyframe", "link", "image", "view"):
         _delete_row(db, table, key)
     db.execute("DELETE FROM loop WHERE a_run = ? AND a_id = ?", key)
     db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)

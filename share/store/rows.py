@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 import zlib
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import msgspec
@@ -13,8 +14,9 @@ import numpy as np
 from share.checks import checked_cov, checked_id, checked_pose
 from share.errors import StoreError
 from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.map_changes import SaveKeyframe, SaveLink, SavePoses, SaveRun, StoredKeyframe
-from share.types import F64, Keyframe
+from share.mapping.map_changes import SaveKeyframe, SaveLink, SavePoses, SaveRun, SaveView, StoredKeyframe
+from share.types import F64, U8, Keyframe
+from share.vision.packed_view import PackedView
 from share.wire import codec, messages
 
 M = TypeVar("M")
@@ -29,6 +31,8 @@ COLUMNS = {
     "link": ("run", "id", "reference", "T_ref_body", "cov"),
     "loop": ("a_run", "a_id", "b_run", "b_id", "T_a_b", "cov", "inliers", "found"),
     "poses": ("keys", "T_map_body"),
+    "image": ("run", "id", "jpeg"),
+    "view": ("run", "id", "view"),
 }
 
 _CREDENTIAL_PREFIX = "voice "  # before a run's key, a name in `about`; SHARE 0.1 ignores it
@@ -75,7 +79,18 @@ def credential_row(run: str, credential: str) -> Row:
 
 
 def keyframe_row(keyframe: SaveKeyframe, segment: int, ordinal: int) -> Row:
-    return (*keyframe.keyframe_key, segment, ordinal, codec.WIRE_VERSION, _encode_message(keyframe.keyframe))
+    """Return the row of a keyframe, without its JPEG."""
+    sent = keyframe.keyframe
+    message = _encode_message(replace(sent, image=sent.image.without_jpeg()))
+    return (*keyframe.keyframe_key, segment, ordinal, codec.WIRE_VERSION, message)
+
+
+def image_row(key: KeyframeKey, jpeg: U8) -> Row:
+    return *key, jpeg.tobytes()
+
+
+def view_row(view: SaveView) -> Row:
+    return *view.key, view.view.to_bytes()
 
 
 def link_row(link: SaveLink) -> Row:
@@ -143,6 +158,17 @@ def read_loop(row: Row) -> Loop:
     )
 
 
+def read_image(row: Row) -> tuple[KeyframeKey, U8]:
+    """Return a keyframe and its JPEG (B,)."""
+    agent, id, jpeg = row
+    return _checked_key(agent, id), np.frombuffer(_checked_bytes(jpeg), np.uint8)
+
+
+def read_view(row: Row) -> tuple[KeyframeKey, PackedView]:
+    agent, id, view = row
+    return _checked_key(agent, id), PackedView.from_bytes(_checked_bytes(view))
+
+
 def read_poses(row: Row) -> SavePoses:
     keys = _decode_pose_keys(row[0])
     T = _decode_array(row[1], len(keys), 4, 4)
@@ -162,9 +188,7 @@ def _decode_message(kind: type[M], version: int, data: bytes) -> M:
             f"its keyframes have wire version {version}, this SHARE reads {codec.WIRE_VERSION}: "
             "use the SHARE that wrote it"
         )
-    if not isinstance(data, bytes):
-        raise ValueError(f"expected bytes, found {type(data).__name__}")
-    message = codec.decode(_decode_frames(data), _READABLE_VERSIONS)
+    message = codec.decode(_decode_frames(_checked_bytes(data)), _READABLE_VERSIONS)
     if not isinstance(message, kind):
         raise ValueError(f"is a {type(message).__name__}")
     return message
@@ -172,6 +196,12 @@ def _decode_message(kind: type[M], version: int, data: bytes) -> M:
 
 def _checked_key(agent: Any, id: Any) -> KeyframeKey:
     return KeyframeKey(_checked_text(agent), checked_id("id", _checked_int(id)))
+
+
+def _checked_bytes(value: Any) -> bytes:
+    if not isinstance(value, bytes):
+        raise ValueError(f"expected bytes, found {type(value).__name__}")
+    return value
 
 
 def _checked_text(value: Any) -> str:
@@ -199,6 +229,4 @@ def _encode_array(array: F64) -> bytes:
 
 
 def _decode_array(data: bytes, *shape: int) -> F64:
-    if not isinstance(data, bytes):
-        raise ValueError(f"expected bytes, found {type(data).__name__}")
-    return np.frombuffer(data, "<f8").reshape(shape)
+    return np.frombuffer(_checked_bytes(data), "<f8").reshape(shape)

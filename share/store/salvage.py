@@ -11,7 +11,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +27,8 @@ from share.store.schema import PAGE_BYTES, own_tables
 _DELETE_ORPHANS = (
     "DELETE FROM keyframe WHERE run NOT IN (SELECT key FROM run)",
     "DELETE FROM link WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
+    "DELETE FROM image WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
+    "DELETE FROM view WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
     "DELETE FROM loop WHERE (a_run, a_id) NOT IN (SELECT run, id FROM keyframe)"
     " OR (b_run, b_id) NOT IN (SELECT run, id FROM keyframe)",
 )
@@ -154,6 +156,16 @@ class ReadRows:
     lost_counts: Counter[str] = field(default_factory=Counter)
     uncounted: set[str] = field(default_factory=set)
 
+    @staticmethod
+    def empty() -> ReadRows:
+        """The rows of a new file."""
+        return ReadRows({table: [] for table in COLUMNS})
+
+    def copy(self) -> ReadRows:
+        """Return the same rows in other lists."""
+        tables = {table: list(numbered) for table, numbered in self.tables.items()}
+        return ReadRows(tables, self.lost_counts.copy(), set(self.uncounted))
+
     def row_count(self) -> int:
         return sum(map(len, self.tables.values()))
 
@@ -162,10 +174,13 @@ class ReadRows:
         return any(self.lost_counts.values()) or bool(self.uncounted)
 
 
-def read_intact_rows(connection: sqlite3.Connection) -> ReadRows:
+def read_intact_rows(connection: sqlite3.Connection, tables: Iterable[str] = tuple(COLUMNS)) -> ReadRows:
     """Read all rows of our own tables that are readable and have a correct CRC; count the others."""
     read_rows, own = ReadRows(), _own_tables(connection)
-    for table in COLUMNS:
+    for table in tables:
+        if table in schema.ADDED_TABLES and table not in own:  # the file is of an older schema
+            read_rows.tables[table] = []
+            continue
         table_rows, all_read = _read_table(connection, table) if table in own else ({}, False)
         intact = {n: row for n, row in table_rows.items() if is_intact(table, n, row)}
         read_rows.tables[table] = [(n, row[:-1]) for n, row in sorted(intact.items())]

@@ -1,9 +1,11 @@
 from collections import Counter
+from collections.abc import Generator
 
 import numpy as np
 import pytest
 
-from share.mapping.recognition.index import PlaceIndex, build_page, merge_pages
+from share.mapping.recognition import index as index_module
+from share.mapping.recognition.index import IndexPage, PlaceIndex, build_page, merge_in_steps
 from share.types import U8
 
 
@@ -17,6 +19,16 @@ def filled(n: int, rng: np.random.Generator) -> tuple[PlaceIndex, list[U8]]:
     for i, descriptors in enumerate(places):
         index.add(1000 + i, descriptors)
     return index, places
+
+
+def merged(pages: list[IndexPage]) -> IndexPage:
+    steps = merge_in_steps(pages)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            page: IndexPage = end.value
+            return page
 
 
 def test_a_half_overlapping_view_is_found() -> None:
@@ -101,7 +113,7 @@ def test_removed_keyframes_can_be_added_again() -> None:
 
 def test_merged_pages_equal_one_page_of_the_remaining_keyframes() -> None:
     rng = np.random.default_rng(8)
-    vocabulary = 150_000  # joined in several blocks
+    vocabulary = 300_000  # merged in several steps
     common = rng.integers(0, vocabulary, 500, np.uint32)
     views = [np.append(rng.choice(common, n), [0, vocabulary - 1]).astype(np.uint32) for n in range(120)]
     pages = [build_page(range(i, j), views[i:j], vocabulary) for i, j in ((0, 70), (70, 80), (80, 120))]
@@ -109,7 +121,7 @@ def test_merged_pages_equal_one_page_of_the_remaining_keyframes() -> None:
     for page in pages:
         page.is_alive[np.isin(page.ids, dead)] = False
     left = [i for i in range(120) if i not in dead]
-    one, whole = merge_pages(pages), build_page(left, [views[i] for i in left], vocabulary)
+    one, whole = merged(pages), build_page(left, [views[i] for i in left], vocabulary)
     for name in ("ids", "sizes", "is_alive", "starts", "slots"):
         np.testing.assert_array_equal(getattr(one, name), getattr(whole, name), name, strict=True)
 
@@ -155,3 +167,51 @@ def test_words_of_removed_keyframes_are_not_counted() -> None:
     for place in places:
         scores, expected = ({c.id: c.score for c in one.query(place, 120)} for one in (index, only))
         assert scores == pytest.approx(expected, rel=0.14)  # a page keeps some until it is rewritten
+
+
+def test_a_query_reads_no_more_of_a_large_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entries, where all words are frequent."""
+    rng, read = np.random.default_rng(9), Counter[int]()
+    votes = IndexPage.votes
+
+    def counted(page: IndexPage, words: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        read[len(index)] += int((page.starts[words + 1] - page.starts[words]).astype(np.int64).sum())
+        return votes(page, words, weights)
+
+    monkeypatch.setattr(IndexPage, "votes", counted)
+    things = rng.integers(0, 256, (60, 32), np.uint8)
+    index = PlaceIndex(seed=0)
+    for count in (2000, 12_000):
+        for i in range(len(index), count):
+            index.add(i, things[rng.integers(60, size=20)])
+        assert index.query(things[:20], 5)
+    assert 0 < read[12_000] <= 1.5 * read[2000]
+
+
+def test_no_addition_takes_long_while_pages_are_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entries that are merged with one keyframe; all are found meanwhile."""
+    rng, steps = np.random.default_rng(10), [0]
+    merge = index_module.merge_in_steps
+
+    def counted(pages: list[IndexPage]) -> Generator[int, None, IndexPage]:
+        work = merge(pages)
+        while True:
+            try:
+                entries = next(work)
+            except StopIteration as end:
+                page: IndexPage = end.value
+                return page
+            steps[-1] += entries
+            yield entries
+
+    monkeypatch.setattr(index_module, "merge_in_steps", counted)
+    monkeypatch.setattr(index_module, "_ENTRIES_PER_STEP", 20_000)
+    index = PlaceIndex(seed=0)
+    places = [rng.integers(0, 256, (100, 32), np.uint8) for _ in range(700)]
+    for i, place in enumerate(places):
+        index.add(i, place)
+        steps.append(0)
+        if i % 97 == 96:
+            assert index.query(place, 1)[0].id == i and len(index) == i + 1
+            assert index.query(places[i // 2], 1)[0].id == i // 2
+    assert max(steps) < 3 * 20_000 < 0.1 * sum(steps)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,9 +17,12 @@ from share.config import Config
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.map_changes import MapChange, SaveKeyframe, SaveRun, SaveView
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
 from share.mapping.steps import AlignStep, DescribeStep, QueryStep, Step, VerifyStep
+from share.store.keyframe_archive import KeyframeArchive
+from share.store.map_store import MapStore
 from share.types import Keyframe, KeyframeImage, View
 from share.vision.image_codec import encode_jpeg
 
@@ -250,3 +254,31 @@ def test_a_damaged_image_costs_the_keyframe_its_features_only(place: Planes) -> 
     assert mapper.report()["failed_steps"] == 0
     mapper.remove_keyframes([done[0][0].node_id])
     assert len(mapper._views.index) == len(mapper._views.by_node)
+
+
+@pytest.mark.long
+def test_a_restored_map_is_recognised_by_the_views_in_its_file(place: Planes, tmp_path: Path) -> None:
+    """Nothing is described again, but the keyframe whose view is not in the file."""
+    first, changes = mapper_of("ann"), list[MapChange]()
+    ann = [sent for _, sent in keyframes(place, -0.1, 1)]
+    for sent in ann:
+        first.add_keyframe("ann", sent)
+        changes.append(SaveKeyframe("ann", sent))
+        work(first)
+    described = [change for change in first.take_changes() if isinstance(change, SaveView)]
+    assert [change.key.id for change in described] == [sent.id for sent in ann]
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        hello = replace(hello_of("ann", 1), rig=RIG)
+        store.write([SaveRun("ann", hello), *changes, *described[:-1], first.current_poses()])
+    second = Mapper(Config(), KeyframeArchive(path))
+    second.restore(MapStore.read(path).load())
+    done = work(second)
+    assert [step.node_id for step, _ in done if isinstance(step, DescribeStep)] == [len(ann) - 1]
+    assert [change.key.id for change in second.take_changes() if isinstance(change, SaveView)] == [ann[-1].id]
+    second.add_run("bob", replace(hello_of("bob", 2), rig=RIG))
+    for _, sent in keyframes(place, 0.0, 2, steps=7):
+        second.add_keyframe("bob", sent)
+        work(second)
+    assert second.atlas.map_sizes() == {"ann/0": 11}
+    assert second.report()["failed_steps"] == 0

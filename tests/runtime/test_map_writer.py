@@ -28,6 +28,8 @@ def poses(number):
 class Disk:
     """A store whose `write` raises what it is told to."""
 
+    problems = ()
+
     def __init__(self):
         self.rows, self.error, self.tries, self.closed = [], None, 0, False
         self.go_on = threading.Event()

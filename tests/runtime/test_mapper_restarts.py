@@ -43,7 +43,7 @@ class Link:
     def close(self): ...
 
 
-def dies_of_a_map(inbox, answer, settings):
+def dies_of_a_map(inbox, answer, settings, map_file):
     """A mapper that cannot take in any keyframe."""
     while (message := inbox.get()) is not END:
         if isinstance(message, RestoreMap):
@@ -52,7 +52,7 @@ def dies_of_a_map(inbox, answer, settings):
             answer(MapRestored())
 
 
-def dies_later(inbox, answer, settings):
+def dies_later(inbox, answer, settings, map_file):
     """A mapper that dies of what comes after its map."""
     while (message := inbox.get()) is not END:
         if isinstance(message, RestoreMap):
@@ -161,7 +161,7 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
 
 class Store:
     def __init__(self, load, writable=True):
-        self.load, self.writable, self.asides = load, writable, 0
+        self.rows, self.writable, self.asides = load, writable, 0
 
     def set_aside(self):
         self.asides += 1
@@ -197,7 +197,7 @@ def test_runs_without_a_credential_are_unknown_to_an_edge_with_keys(path):
     for has_keys, bob in ((True, None), (False, "")):
         store = MapStore.read(path)
         kept, known = MapperRestarts(store, 0.05, print, has_keys).load_map()
-        voices = {run.run_key: run.credential for run in kept.runs}
+        voices = {run.run_key: run.credential for run in kept.stored_map.runs}
         assert voices == {run.key: run.credential for run in known} == {ANN: "key of ann", BOB: bob}
 
 
@@ -219,7 +219,7 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     until(lambda: run.report()["session"] != session)
 
 
-def counts(inbox, answer, settings):
+def counts(inbox, answer, settings, map_file):
     """A mapper that has looked up seven keyframes and dies."""
     answer(MapperReport({"loops": {"tried": 7, "accepted": 2}, "place_ms": {"n": 7}, "maps": {}}))
     time.sleep(0.1)
@@ -270,7 +270,7 @@ def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
     until(lambda: not any("stuck" in line for line in run.report()["trouble"]))
 
 
-def fails_to_solve(inbox, answer, settings):
+def fails_to_solve(inbox, answer, settings, map_file):
     """A mapper whose first solution fails."""
     reason = "map ann-1/0: solve: RuntimeError: no pivot"
     answer(MapperResult([MapEvent(None, "step failed", reason, map_id="ann-1/0")]))

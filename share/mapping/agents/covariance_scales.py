@@ -85,7 +85,8 @@ class CovarianceClaims:
         return set(self._medians)
 
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
-        """Add a step (4, 4) with its covariance (6, 6); return whether the agent's median changed."""
+        """Add a step (4, 4) with its covariance (6, 6); return whether the agent's median changed, and it is
+        compared with others."""
         size = float(np.linalg.norm(T_ref_body[:3, 3]) + _LEVER_M * se3.rotation_angle(T_ref_body))
         rotation_variance, position_variance = float(np.trace(cov[:3, :3])), float(np.trace(cov[3:, 3:]))
         if not min(size, rotation_variance, position_variance) > 0:
@@ -95,7 +96,7 @@ class CovarianceClaims:
         if len(steps) < _MIN_STEPS:
             return False
         self._medians[agent] = np.median(np.array(steps), axis=0)
-        return True
+        return bool(self._linked.get(agent))
 
     def link(self, first: str, second: str) -> None:
         """Compare these agents from now on: there is a loop between them."""
@@ -161,10 +162,12 @@ class CovarianceScales:
         self._loop_scales: dict[SegmentPair, float] = {}
         self.evidence: dict[SegmentPair, _VarianceEvidence] = {}
 
-    def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> None:
-        """Add a step (4, 4) of an agent's odometry with its covariance (6, 6)."""
-        if self.claims.add_step(agent, T_ref_body, cov):
+    def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
+        """Add a step (4, 4) of an agent's odometry with its covariance (6, 6); return whether scales may have
+        changed."""
+        if is_compared := self.claims.add_step(agent, T_ref_body, cov):
             self._estimate()
+        return is_compared
 
     def set_evidence(
         self, segment_pair: SegmentPair, agents: tuple[str, str], equations: ComparisonEquations, weights: F64

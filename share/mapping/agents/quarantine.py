@@ -6,7 +6,7 @@ Small scale errors are corrected, and understated variances enlarged.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +20,6 @@ from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
 from share.mapping.loops import Loop
 from share.mapping.map_graph import MapGraph, rescale_translation
 from share.mapping.recognition.depth_scale import DepthScale
-from share.mapping.recognition.verification import CameraView
 from share.types import F64
 
 _MIN_LOOP_SUPPORT = 12  # loops between two segments; fewer may fit only because a map was bent
@@ -37,16 +36,11 @@ class QuarantineChange:
 
 
 class Quarantine:
-    """Quarantine in one graph. camera_views: by node id. withdrawn: loops that are kept for later."""
+    """Quarantine in one graph. withdrawn: loops that are kept for later."""
 
-    def __init__(
-        self,
-        graph: MapGraph,
-        loop_acceptance: LoopAcceptance,
-        camera_views: Mapping[int, CameraView],
-    ) -> None:
+    def __init__(self, graph: MapGraph, loop_acceptance: LoopAcceptance) -> None:
         self.agreement = AgentAgreement()
-        self._graph, self._loop_acceptance, self._camera_views = graph, loop_acceptance, camera_views
+        self._graph, self._loop_acceptance = graph, loop_acceptance
         self.withdrawn: list[Loop] = []
 
     def remove_run(self, run: str) -> None:
@@ -59,8 +53,8 @@ class Quarantine:
         """Add a node, by odometry from the previous one of its segment."""
         odometry = self._graph.odometry
         agent = odometry.nodes[node_id].key.agent
-        self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov)
-        self.apply_scales()
+        if self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov):
+            self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
         """Compare the agents of a verified loop, and split maps of agents that no longer agree.
@@ -211,12 +205,7 @@ class Quarantine:
         return {self._graph.odometry.segments[s].agent for s in self._graph.map_segments(reference_segment)}
 
     def _tilt(self, edge: PoseEdge) -> tuple[float, float] | None:
-        if not {edge.a, edge.b} <= self._camera_views.keys():
+        a, b = (self._graph.gravity_factors.get(n) for n in (edge.a, edge.b))
+        if a is None or b is None:
             return None
-        a, b = (self._camera_views[n].up for n in (edge.a, edge.b))
-        return tilt_between(a, self._gravity_sigma(edge.a), b, self._gravity_sigma(edge.b), edge)
-
-    def _gravity_sigma(self, node_id: int) -> float:
-        """Sigma of the up direction, rad, with its floor; pi where unknown."""
-        factor = self._graph.gravity_factors.get(node_id)
-        return float(np.pi) if factor is None else 1 / float(np.linalg.norm(factor))
+        return tilt_between(a, 1 / float(np.linalg.norm(a)), b, 1 / float(np.linalg.norm(b)), edge)

@@ -5,17 +5,17 @@ share a word with probability (1 - d/256)^16, so the tables form a vocabulary th
 Sources: bit-sampling locality-sensitive hashing, Indyk and Motwani, STOC 1998; tf-idf scoring, Sivic and
 Zisserman, ICCV 2003.
 
-A query reads the entries of rare words first and stops at 64 per stored keyframe, 400,000 in all: frequent
+A query reads the entries of rare words first and stops at 64 per stored keyframe, 128,000 in all: frequent
 words say little, cost most, and mislead (stop words, Sivic and Zisserman). So query time hardly grows with
 the map.
 
 The newest keyframes are compared one by one. They are then written to a page, and four pages of similar size
-are merged (a log-structured merge tree, up to a maximum page size, so that no `add` takes long).
+are merged (a log-structured merge tree), a step with each `add` and `remove`, so that none takes long.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,11 +27,12 @@ from share.types import F32, F64, I64, U8
 TABLES = 8  # hash functions
 HASH_BITS = 16  # descriptor bits that form a word in each table
 SEED = 1  # of the choice of these bits
-_MAX_UNPAGED = 64  # keyframes compared one by one
+_MAX_UNPAGED = 32  # keyframes compared one by one
 _MAX_DEAD_SHARE = 0.25  # removed keyframes of a page; beyond, it is rewritten
 _ENTRIES_PER_KEYFRAME = 64  # entries that a query reads, per stored keyframe
-_MIN_ENTRIES, _MAX_ENTRIES = 30_000, 400_000  # limits on all entries that a query reads
+_MIN_ENTRIES, _MAX_ENTRIES = 30_000, 128_000  # limits on all entries that a query reads
 _PAGES_PER_MERGE = 4
+_MAX_PAGES = 12  # beyond, the smallest two neighbours are merged
 
 
 class PlaceCandidate(NamedTuple):
@@ -53,6 +54,7 @@ class PlaceIndex:
         self._word_counts = np.zeros(tables << bits, np.int32)
         self._pages: list[IndexPage] = []
         self._unpaged: dict[int, U32] = {}  # words of the newest keyframes
+        self._merge: Iterator[int] | None = None
 
     def __len__(self) -> int:
         return len(self._unpaged) + sum(int(page.is_alive.sum()) for page in self._pages)
@@ -64,7 +66,10 @@ class PlaceIndex:
 
     def add(self, id: int, descriptors: U8) -> None:
         """Add keyframe `id` with its descriptors (N, 32)."""
-        words = self.words(descriptors)
+        self.add_words(id, self.words(descriptors))
+
+    def add_words(self, id: int, words: U32) -> None:
+        """Add keyframe `id` with the words of its descriptors."""
         np.add.at(self._word_counts, words, np.int32(1))  # another dtype is 30 times slower
         self._unpaged[id] = words
         if len(self._unpaged) == _MAX_UNPAGED:
@@ -72,19 +77,18 @@ class PlaceIndex:
                 build_page(list(self._unpaged), list(self._unpaged.values()), len(self._word_counts))
             )
             self._unpaged.clear()
-            self._merge_pages(_PAGES_PER_MERGE)
+        self._continue_merge()
 
     def remove(self, id: int) -> None:
         """Remove keyframe `id`. Raises KeyError if it is not stored."""
         if id in self._unpaged:
             np.add.at(self._word_counts, self._unpaged.pop(id), np.int32(-1))
             return
-        for page_index, page in enumerate(self._pages):
+        for page in self._pages:
             row = np.flatnonzero((page.ids == id) & page.is_alive)
             if len(row):
                 page.is_alive[row] = False
-                if page.is_alive.mean() < 1 - _MAX_DEAD_SHARE:
-                    self._compact_page(page_index)
+                self._continue_merge()
                 return
         raise KeyError(f"keyframe {id} is not in the index")
 
@@ -101,7 +105,7 @@ class PlaceIndex:
         ids, sizes, votes = (np.concatenate(column) for column in zip(*parts, strict=True))
         scores = votes / np.sqrt(np.maximum(1, sizes))
         scores[np.isin(ids, list(exclude))] = 0.0
-        ranked = np.argsort(-scores, kind="stable")[:limit]
+        ranked = _best(scores, limit)
         return [PlaceCandidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
 
     def _weight_words(self, descriptors: U8) -> tuple[I64, F64]:
@@ -124,27 +128,45 @@ class PlaceIndex:
         votes = np.array([word_weights[w].sum() for w in views], np.float64)
         return np.array(list(self._unpaged), np.int64), np.array([len(w) for w in views], np.int64), votes
 
-    def _merge_pages(self, count: int) -> None:
-        """Merge the newest `count` adjacent pages that fit in one, the first at most twice the last."""
-        for first in range(len(self._pages) - count, -1, -1):
-            pages = self._pages[first : first + count]
-            if sum(map(len, pages)) <= MAX_PAGE_KEYFRAMES and len(pages[0]) <= 2 * len(pages[-1]):
-                self._replace_pages(first, pages, merge_pages(pages))
+    def _continue_merge(self) -> None:
+        """Go on with the merge that runs, or the next one, by some `_ENTRIES_PER_STEP`."""
+        entries = 0
+        while entries < _ENTRIES_PER_STEP:
+            if self._merge is None and (pages := self._next_pages()):
+                self._merge = self._merge_run(*pages)
+            if self._merge is None:
                 return
+            step = next(self._merge, None)
+            if step is None:
+                self._merge = None
+            entries += step or 0
 
-    def _compact_page(self, page_index: int) -> None:
-        """Drop the removed keyframes of a page."""
-        page = self._pages[page_index]
-        self._replace_pages(page_index, [page], page.compact())
-        self._merge_pages(2)
+    def _next_pages(self) -> tuple[int, int] | None:
+        """First and number of the pages to merge next: one with many removed keyframes, and a neighbour of
+        similar size; the newest of similar size; or the smallest two neighbours where there are many."""
+        sizes = [int(page.is_alive.sum()) for page in self._pages]
+        for index, page in enumerate(self._pages):
+            if sizes[index] < (1 - _MAX_DEAD_SHARE) * len(page):
+                first = max(0, min(index, len(sizes) - 2))
+                pair = sizes[first : first + 2]
+                is_pair = len(pair) == 2 and max(pair) <= 2 * min(pair) and sum(pair) <= MAX_PAGE_KEYFRAMES
+                return (first, 2) if is_pair else (index, 1)
+        for first in range(len(sizes) - _PAGES_PER_MERGE, -1, -1):
+            run = sizes[first : first + _PAGES_PER_MERGE]
+            if sum(run) <= MAX_PAGE_KEYFRAMES and run[0] <= 2 * run[-1]:
+                return first, _PAGES_PER_MERGE
+        size, first = min((sum(sizes[i : i + 2]), i) for i in range(max(1, len(sizes) - 1)))
+        return (first, 2) if len(sizes) > _MAX_PAGES and size <= MAX_PAGE_KEYFRAMES else None
 
-    def _replace_pages(self, first: int, old: list[IndexPage], new: IndexPage) -> None:
-        """Put `new` in place of pages `old`, and subtract the words of dropped keyframes."""
-        if sum(map(len, old)) > len(new):
-            self._word_counts -= (sum(page.word_counts() for page in old) - new.word_counts()).astype(
-                np.int32
-            )
-        self._pages[first : first + len(old)] = [new] if len(new) else []
+    def _merge_run(self, first: int, count: int) -> Iterator[int]:
+        """Put one page in place of `count`, and subtract the words of keyframes that it dropped. Yields the
+        entries of each step. Pages that come meanwhile are behind them."""
+        pages = self._pages[first : first + count]
+        merged = yield from merge_in_steps(pages)
+        if sum(map(len, pages)) > len(merged):
+            dropped = sum(page.word_counts() for page in pages) - merged.word_counts()
+            self._word_counts -= dropped.astype(np.int32)
+        self._pages[first : first + count] = [merged] if len(merged) else []
 
     def words(self, descriptors: U8) -> U32:
         """Words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
@@ -159,15 +181,16 @@ class PlaceIndex:
 
 U32 = NDArray[np.uint32]
 
-_SLOT_BITS = 10
+_SLOT_BITS = 13
 MAX_PAGE_KEYFRAMES = 1 << _SLOT_BITS
+_DROPPED = np.uint16((1 << 16) - 1)  # no slot
 MAX_WORDS = 1 << (32 - _SLOT_BITS)  # word and slot are sorted as one uint32
-_MERGE_BLOCK = 1 << 16  # words merged at a time: allocating for all at once doubles the time
+_ENTRIES_PER_STEP = 200_000  # of a merge, about
 
 
 @dataclass(frozen=True, eq=False)
 class IndexPage:
-    """Up to 1024 keyframes: ids (n,), number of words of each (n,), and which are not removed (n,).
+    """Up to 8192 keyframes: ids (n,), number of words of each (n,), and which are not removed (n,).
 
     The keyframes with word w are slots[starts[w] : starts[w + 1]], indices below n.
     """
@@ -194,15 +217,6 @@ class IndexPage:
         starts = self.starts.astype(np.int64)
         return starts[1:] - starts[:-1]
 
-    def compact(self) -> IndexPage:
-        if self.is_alive.all():
-            return self
-        kept = self.is_alive[self.slots]
-        starts = np.zeros(1 + len(kept), np.uint32)
-        np.cumsum(kept, out=starts[1:])
-        slots = (np.cumsum(self.is_alive) - 1).astype(np.uint16)[self.slots.compress(kept)]
-        return _new_page(self.ids[self.is_alive], self.sizes[self.is_alive], starts[self.starts], slots)
-
 
 def build_page(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> IndexPage:
     """Build a page from keyframes by their words, each (N,) below `vocabulary`."""
@@ -214,29 +228,67 @@ def build_page(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> Ind
     return _new_page(np.array(ids, np.int64), np.array([len(v) for v in views]), starts, slots)
 
 
-def merge_pages(pages: Sequence[IndexPage]) -> IndexPage:
-    """Merge pages, dropping removed keyframes.
+def merge_in_steps(pages: Sequence[IndexPage]) -> Generator[int, None, IndexPage]:
+    """Merge pages in steps of some milliseconds, dropping removed keyframes. Yields the entries of each.
 
-    Entries are sorted by word already: under each word the pages' runs are concatenated.
+    Keyframes that are removed meanwhile are removed ones of the result.
     """
-    pages = [page.compact() for page in pages]
+    kept = [np.flatnonzero(page.is_alive) for page in pages]
+    sizes = np.concatenate([page.sizes[slots] for page, slots in zip(pages, kept, strict=True)])
+    new_slots, first_slot = [], 0
+    for page, slots in zip(pages, kept, strict=True):
+        new_slot = np.full(len(page), _DROPPED, np.uint16)
+        new_slot[slots] = np.arange(first_slot, first_slot + len(slots))
+        new_slots.append(new_slot)
+        first_slot += len(slots)
     starts: U32 = np.zeros_like(pages[0].starts)
-    for page in pages:
-        starts += page.starts
-    slots = np.empty(starts[-1], np.uint16)
-    first_slot, offsets = 0, starts[:-1].astype(np.int64)  # entries of earlier pages under each word
-    for page in pages:
-        offsets -= page.starts[:-1]
-        for word in range(0, len(offsets), _MERGE_BLOCK):
-            own = page.starts[word : word + _MERGE_BLOCK + 1].astype(np.int64)
-            positions = np.repeat(offsets[word : word + _MERGE_BLOCK], np.diff(own)) + np.arange(
-                own[0], own[-1]
-            )
-            slots[positions] = page.slots[own[0] : own[-1]] + np.uint16(first_slot)
-        offsets += page.starts[1:]
-        first_slot += len(page)
-    ids, sizes = (np.concatenate([getattr(page, name) for page in pages]) for name in ("ids", "sizes"))
-    return _new_page(ids, sizes, starts, slots)
+    out = np.empty(int(sizes.sum()), np.uint16)
+    yield _ENTRIES_PER_STEP // 2  # for the arrays
+    filled, bounds = 0, _step_bounds(pages)
+    for low, high in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
+        words, slots = _entries(pages, new_slots, low, high)
+        count = np.bincount(words, minlength=high - low)
+        out[filled : filled + len(slots)] = slots
+        starts[low + 1 : high + 1] = filled + np.cumsum(count)
+        filled += len(slots)
+        yield len(slots)
+    ids = np.concatenate([page.ids[slots] for page, slots in zip(pages, kept, strict=True)])
+    is_alive = np.concatenate([page.is_alive[slots] for page, slots in zip(pages, kept, strict=True)])
+    return IndexPage(ids, sizes, is_alive, starts, out)
+
+
+def _step_bounds(pages: Sequence[IndexPage]) -> I64:
+    """Ascending words, the first and last included, between which there are about as many entries as a step
+    has."""
+    entries = sum(page.starts.astype(np.int64) for page in pages)
+    inner = np.searchsorted(entries, np.arange(_ENTRIES_PER_STEP, entries[-1], _ENTRIES_PER_STEP))
+    return np.unique(np.concatenate([[0], inner, [len(entries) - 1]]))
+
+
+def _entries(
+    pages: Sequence[IndexPage], new_slots: Sequence[NDArray[np.uint16]], low: int, high: int
+) -> tuple[NDArray[np.intp], NDArray[np.uint16]]:
+    """Words (N,), counted from `low`, and new slots (N,) of the entries of words low .. high - 1, by word."""
+    words, slots = [], []
+    for page, new_slot in zip(pages, new_slots, strict=True):
+        starts = page.starts[low : high + 1].astype(np.int64)
+        of_page = new_slot[page.slots[starts[0] : starts[-1]]]
+        is_kept = of_page != _DROPPED
+        words.append(np.repeat(np.arange(high - low), np.diff(starts))[is_kept])
+        slots.append(of_page[is_kept])
+    all_words, all_slots = np.concatenate(words), np.concatenate(slots)
+    order = np.argsort(all_words, kind="stable")
+    return all_words[order], all_slots[order]
+
+
+def _best(scores: F64, limit: int) -> I64:
+    """Indices of the `limit` best scores, best first, of equal ones the first."""
+    if 0 < limit < len(scores):
+        worst = np.partition(scores, -limit)[-limit]
+        among = np.flatnonzero(scores >= worst)
+    else:
+        among = np.arange(len(scores))
+    return among[np.argsort(-scores[among], kind="stable")][:limit]
 
 
 def _new_page(ids: I64, sizes: I64, starts: U32, slots: NDArray[np.uint16]) -> IndexPage:

@@ -18,20 +18,26 @@ _MAX_PER_SEGMENT = 2  # so that loops with other agents come too
 def nearby_candidates(graph: MapGraph, node_id: int, eligible: AbstractSet[int]) -> list[int]:
     """Return the keyframes of the map, of those eligible, that see most of what this one sees, best first;
     without its neighbours by odometry."""
-    reference_segment = graph.reference_segments[graph.odometry.nodes[node_id].segment]
     excluded = {node_id, *graph.odometry.neighbours(node_id)}
-    nodes = [n for n in graph.map_nodes(reference_segment) if n in eligible and n not in excluded]
-    if not nodes:
-        return []
-    poses = np.array([graph.poses[n] for n in nodes])
-    (distance,), (angle,) = se3.pairwise_distances(graph.poses[node_id][None], poses)
-    cost = distance / _NEAR_M + angle / _NEAR_RAD
-    near = np.flatnonzero((distance < _NEAR_M) & (angle < _NEAR_RAD))
     chosen: list[int] = []
     per_segment = Counter[int]()
-    for i in near[np.argsort(cost[near], kind="stable")]:
-        segment = graph.odometry.nodes[nodes[i]].segment
-        if per_segment[segment] < _MAX_PER_SEGMENT and len(chosen) < _MAX_CANDIDATES:
+    for near_id in _nearest_first(graph, node_id):
+        segment = graph.odometry.nodes[near_id].segment
+        if near_id in excluded or near_id not in eligible or not graph.is_same_map(node_id, near_id):
+            continue
+        if per_segment[segment] < _MAX_PER_SEGMENT:
             per_segment[segment] += 1
-            chosen.append(nodes[i])
+            chosen.append(near_id)
+        if len(chosen) == _MAX_CANDIDATES:
+            break
     return chosen
+
+
+def _nearest_first(graph: MapGraph, node_id: int) -> list[int]:
+    """Return the nodes of all maps within the limits, those that see most of what this one sees first."""
+    T = graph.poses[node_id]
+    node_ids, poses = graph.poses.near(T, _NEAR_M)
+    (distance,), (angle,) = se3.pairwise_distances(T[None], poses)
+    cost = np.where(angle < _NEAR_RAD, distance / _NEAR_M + angle / _NEAR_RAD, np.inf)
+    order = np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]
+    return [int(n) for n in node_ids[order]]
