@@ -182,8 +182,8 @@ def relative_covariances(
 ) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
-    gravity_factors (n, 3): where there are any, they tell how far poses are tilted relative to one another.
-    Every wanted pose must be connected to the anchor. Where edges differ too much in certainty (beyond some 16 orders of magnitude) to
+    gravity_factors (n, 3): where there are any, tilts are relative to gravity. Every wanted pose must be
+    connected to the anchor. Where edges differ too much in certainty (beyond some 16 orders of magnitude) to
     give a result, a sigma of 1000 rad and m says so.
     """
     n, out = len(gravity_factors), np.zeros((len(wanted), 6, 6))
@@ -201,10 +201,9 @@ def relative_covariances(
     )
     J = weighted_jacobians(result.residuals[selected], weights[selected], local_edges)
     unary = gravity_equations(result.poses[poses], gravity_factors[poses])
-    ends = np.searchsorted(poses, np.concatenate([[anchor], wanted[not_anchor]]))
-    covs = _joint_covariances(equations.information_matrix(J, unary), ends)
-    T_anchor_wanted = se3.inverse(result.poses[anchor]) @ result.poses[wanted[not_anchor]]
-    out[not_anchor] = _relative_to_first(covs, result.gauge_projector, T_anchor_wanted)
+    out[not_anchor] = _inverse_diagonal_blocks(
+        equations.information_matrix(J, unary), np.searchsorted(poses, wanted[not_anchor])
+    )
     return out
 
 
@@ -223,26 +222,18 @@ def _tightest_edges(n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I
     return np.flatnonzero(used)
 
 
-def _joint_covariances(information: Any, ends: I64) -> F64:
-    """Blocks (K, K, 6, 6) of the inverse at the poses `ends` (K,)."""
+def _inverse_diagonal_blocks(information: Any, wanted: I64) -> F64:
+    """Diagonal blocks (K, 6, 6) of the inverse at `wanted`."""
     from scipy.sparse.linalg import splu
 
     symmetric = {"SymmetricMode": True}
     factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
-    rows = (6 * ends[:, None] + np.arange(6)).ravel()
-    right = np.zeros((information.shape[0], len(rows)))
-    right[rows, np.arange(len(rows))] = 1
-    blocks: F64 = factor.solve(right)[rows].reshape(len(ends), 6, len(ends), 6).swapaxes(1, 2)
-    return blocks
-
-
-def _relative_to_first(covs: F64, projector: F64, T_first_others: F64) -> F64:
-    """Covariances (K, 6, 6) of the other poses relative to the first, which moves as `projector` (6, 6)
-    allows. covs (K + 1, K + 1, 6, 6), T_first_others (K, 4, 4)."""
-    own = covs[range(1, len(covs)), range(1, len(covs))]
-    by_first = se3.adjoint(se3.inverse(T_first_others)) @ projector  # error of the first, seen from the others
-    cross = covs[1:, 0] @ np.swapaxes(by_first, 1, 2)
-    relative = own - cross - np.swapaxes(cross, 1, 2) + by_first @ covs[0, 0] @ np.swapaxes(by_first, 1, 2)
-    relative = (relative + np.swapaxes(relative, 1, 2)) / 2
-    is_positive = np.linalg.eigvalsh(relative)[:, 0] > 0
-    return np.where(is_positive[:, None, None], relative, _UNKNOWN_COV)
+    rows = 6 * wanted[:, None] + np.arange(6)
+    k = len(wanted)
+    right = np.zeros((information.shape[0], 6 * k))
+    right[rows.ravel(), np.arange(6 * k)] = 1
+    blocks = factor.solve(right)[rows.ravel()].reshape(k, 6, k, 6)
+    blocks = blocks[np.arange(k), :, np.arange(k)]
+    blocks = (blocks + np.swapaxes(blocks, 1, 2)) / 2
+    is_positive = np.linalg.eigvalsh(blocks)[:, 0] > 0
+    return np.where(is_positive[:, None, None], blocks, _UNKNOWN_COV)

@@ -64,7 +64,9 @@ def turned_back(poses: F64, before: F64, anchor_index: int) -> F64:
 def _turned(poses: F64, rotation: F64, anchor_index: int) -> F64:
     """Return poses turned by a rotation (3,) rad about the anchor, in the map's axes."""
     R, pivot = se3.so3_exp(rotation), poses[anchor_index, :3, 3]
-    out: F64 = se3.from_rt(R, pivot - R @ pivot) @ poses
+    out = poses.copy()
+    out[:, :3, :3] = R @ poses[:, :3, :3]
+    out[:, :3, 3] = pivot + (poses[:, :3, 3] - pivot) @ R.T  # the anchor's position stays to the bit
     return out
 
 
