@@ -137,9 +137,10 @@ class PoseGraphSolver:
         """Return the most likely poses of the component of pose `anchor`.
 
         The anchor stays, except that all turn slowly upright about it where gravity factors are known: a map
-        that turned at once would move under those who are in it. wanted: poses whose covariances are returned,
-        without the tilt of the whole map, which all in it share. An unsolvable component is returned unchanged, with the reason.
-        Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not connected to it.
+        that turned at once would move under those who are in it. wanted: poses whose covariances are
+        returned, without the tilt that the whole map shares. An unsolvable component is returned unchanged,
+        with the reason. Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not
+        connected to it.
         """
         component, component_edges = self._component(anchor)
         pose_ids, edges = self._pose_ids[component], self._edges[component_edges]
