@@ -16,9 +16,9 @@ from share.geometry.interpolation import associate
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.metrics.rpe import rpe_time
+from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.recordings.trajectory import Trajectory
-from share.odometry.inertial_tracker import InertialTracker
 from share.runtime.pipeline import make_tracker, read_frames
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
