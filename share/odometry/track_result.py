@@ -17,7 +17,8 @@ class TrackResult:
     inlier_count: features that the pose is based on. new_segment: odometry began anew before this frame. cov
     (6, 6): of T_odom_body, perturbed on the right, where the tracker knows it. is_consistent: False while
     images and IMU contradict each other. waiting_for: where there is no pose yet. found_count: features
-    found, outliers included. median_nis: over the features; 0 without any.
+    found, outliers included. median_nis: over the features; 0 without any. The covariance is that of a frame
+    whose z axis is up as known now; `share.odometry.tilt_realignment` says how odom differs.
     """
 
     state: TrackState

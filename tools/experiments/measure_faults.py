@@ -197,8 +197,7 @@ def wrongly_ok(part: FaultRun, truth: Trajectory) -> np.ndarray:
     if not results:
         return np.zeros(0, bool)
     T, cov = estimate.T[known], np.array([r.cov for r in results])
-    if results[0].state is TrackState.VISION_ONLY:  # no gravity
-        true = T[0] @ se3.inverse(true[0]) @ true
+    true = T[0] @ se3.inverse(true[0]) @ true  # odom keeps the tilt that it began with
     found = deviations(T, cov, true, np.zeros(len(T), np.int64))
     error, C = found.errors[:, 3:], found.cov[:, 3:, 3:]
     distance = np.linalg.norm(error, axis=1)

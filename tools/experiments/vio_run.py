@@ -16,6 +16,7 @@ from share.geometry.interpolation import associate
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
 from share.metrics.rpe import rpe_time
+from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.recordings.trajectory import Trajectory
 from share.runtime.pipeline import make_tracker, read_frames
@@ -31,11 +32,12 @@ ACCURACY = (
 
 @dataclass
 class TrackedRun:
-    """Of the frames with a pose: stamps, poses, covariances, index of the unbroken segment. CPU ms of every
-    frame and of every keyframe."""
+    """Of the frames with a pose: stamps, published poses, the filter's poses (z up as known then) and their
+    covariances, index of the unbroken segment. CPU ms of every frame and of every keyframe."""
 
     stamps: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)
+    filter_poses: list[F64] = field(default_factory=list)
     covs: list[F64] = field(default_factory=list)
     segments: list[int] = field(default_factory=list)
     track_ms: list[float] = field(default_factory=list)
@@ -46,11 +48,12 @@ class TrackedRun:
     def trajectory(self) -> Trajectory:
         return Trajectory(np.array(self.stamps, np.int64), np.array(self.poses).reshape(-1, 4, 4))
 
-    def add(self, stamp_ns: int, result: TrackResult) -> None:
+    def add(self, stamp_ns: int, result: TrackResult, filter_pose: F64 | None) -> None:
         self.log.segments += result.new_segment
         self.log.add(stamp_ns, self.track_ms[-1], result.state, result.keyframe_ready)
         if result.T_odom_body is not None:
-            assert result.cov is not None  # of the inertial tracker
+            assert result.cov is not None and filter_pose is not None  # of the inertial tracker
+            self.filter_poses.append(filter_pose)
             self.stamps.append(stamp_ns)
             self.poses.append(result.T_odom_body)
             self.covs.append(result.cov)
@@ -69,23 +72,26 @@ class Series:
 def follow(source: Source, settings: Config) -> TrackedRun:
     """Track every frame in turn, causal. Decoding does not count."""
     tracker, run = make_tracker(source.rig, settings), TrackedRun()
+    assert isinstance(tracker, InertialTracker)  # all sequences have an IMU
     for frame in read_frames(source, settings, SequencerCounters()):
         began = time.process_time()
         result = tracker.track(frame)
         run.track_ms.append(1e3 * (time.process_time() - began))
+        filter_pose = None if tracker.state is None else tracker.state.T
         if result.keyframe_ready:
             began = time.process_time()
             tracker.make_keyframe(frame)
             tracker.finish_keyframe()
             run.keyframe_ms.append(1e3 * (time.process_time() - began))
-        run.add(frame.stamp_ns, result)
+        run.add(frame.stamp_ns, result, filter_pose)
     return run
 
 
 def series(source: Source, run: TrackedRun) -> Series:
     truth, (stamps, _) = source.truth(), run.trajectory
     assert truth is not None  # the emulator writes it
-    at, poses, true = associate(run.trajectory, truth)
+    filter_poses = np.array(run.filter_poses).reshape(-1, 4, 4)
+    at, poses, true = associate(Trajectory(stamps, filter_poses), truth)
     chosen = np.isin(stamps, at)
     segment = np.array(run.segments, np.int64)[chosen]
     covs = np.array(run.covs).reshape(-1, 6, 6)[chosen]

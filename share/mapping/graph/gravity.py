@@ -13,6 +13,7 @@ import numpy as np
 from share.geometry import se3
 from share.types import F64, Keyframe
 
+_UPRIGHT_STEP_RAD = np.radians(0.001)  # by which a solution turns a map upright: nobody in it notices
 _FLOOR_DEG = 0.1  # added to sigma in quadrature: error of the IMU calibration
 
 
@@ -35,6 +36,38 @@ def gravity_equations(poses: F64, gravity_factors: F64) -> tuple[F64, F64]:
     gradient[:, :3] = (np.swapaxes(J, 1, 2) @ _gravity_residual(poses, gravity_factors)[:, :, None])[:, :, 0]
     hessian[:, :3, :3] = np.swapaxes(J, 1, 2) @ J
     return gradient, hessian
+
+
+def turned_upright(poses: F64, gravity_factors: F64, anchor_index: int) -> F64:
+    """Return poses (N, 4, 4) turned about the anchor so that their mean up direction, weighted by its
+    information, is the z axis; as they are where none is known."""
+    weighted = gravity_factors * np.linalg.norm(gravity_factors, axis=1)[:, None]
+    up = (poses[:, :3, :3] @ weighted[:, :, None])[:, :, 0].sum(axis=0)
+    axis = np.array([up[1], -up[0], 0.0])  # times the sine of the angle to z
+    length = float(np.linalg.norm(axis))
+    if not length:
+        return poses
+    return _turned(poses, axis * (np.arctan2(length, up[2]) / length), anchor_index)
+
+
+def turned_back(poses: F64, before: F64, anchor_index: int) -> F64:
+    """Return poses (N, 4, 4) turned about the anchor to the tilt that it had before, (N, 4, 4), but for
+    `_UPRIGHT_STEP_RAD`."""
+    R_before, R = before[anchor_index, :3, :3], poses[anchor_index, :3, :3]
+    if np.array_equal(R_before, R):
+        return poses
+    turn = se3.so3_log(R_before @ R.T)
+    angle = float(np.linalg.norm(turn))
+    return _turned(poses, turn * max(0.0, 1 - _UPRIGHT_STEP_RAD / angle), anchor_index)
+
+
+def _turned(poses: F64, rotation: F64, anchor_index: int) -> F64:
+    """Return poses turned by a rotation (3,) rad about the anchor, in the map's axes."""
+    R, pivot = se3.so3_exp(rotation), poses[anchor_index, :3, 3]
+    out = poses.copy()
+    out[:, :3, :3] = R @ poses[:, :3, :3]
+    out[:, :3, 3] = pivot + (poses[:, :3, 3] - pivot) @ R.T  # the anchor's position stays to the bit
+    return out
 
 
 def tilt_projector(pose: F64) -> F64:

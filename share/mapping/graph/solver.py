@@ -14,6 +14,7 @@ import numpy as np
 from share.checks import checked_array
 from share.mapping.graph.covariance import relative_covariances
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
+from share.mapping.graph.gravity import turned_back, turned_upright
 from share.mapping.graph.optimiser import chain_order, optimise
 from share.types import F64, I64
 
@@ -135,9 +136,11 @@ class PoseGraphSolver:
     def solve(self, anchor: int, wanted: Sequence[int] = ()) -> GraphSolution:
         """Return the most likely poses of the component of pose `anchor`.
 
-        The anchor stays, except that it turns upright where gravity factors are known. wanted: poses whose
-        covariances are returned. An unsolvable component is returned unchanged, with the reason.
-        Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not connected to it.
+        The anchor stays, except that all turn slowly upright about it where gravity factors are known: a map
+        that turned at once would move under those who are in it. wanted: poses whose covariances are
+        returned, without the tilt that the whole map shares. An unsolvable component is returned unchanged,
+        with the reason. Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not
+        connected to it.
         """
         component, component_edges = self._component(anchor)
         pose_ids, edges = self._pose_ids[component], self._edges[component_edges]
@@ -147,11 +150,10 @@ class PoseGraphSolver:
         rank = np.argsort(order)
         ordered_edges = local_edges.with_ends(rank[local_edges.a], rank[local_edges.b])
         anchor_index = int(rank[np.searchsorted(pose_ids, anchor)])
-        gravity_factors = self._gravity_factors[component][order]
-        minimum = optimise(
-            self._poses[component][order], gravity_factors, ordered_edges, anchor_index, self._cauchy_width
-        )
-        poses = minimum.poses[rank]
+        gravity_factors, before = self._gravity_factors[component][order], self._poses[component][order]
+        upright = turned_upright(before, gravity_factors, anchor_index)
+        minimum = optimise(upright, gravity_factors, ordered_edges, anchor_index, self._cauchy_width)
+        poses = (before if minimum.reason else turned_back(minimum.poses, before, anchor_index))[rank]
         if minimum.reason:
             goals = goals[:0]
         else:
