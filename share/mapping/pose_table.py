@@ -34,7 +34,8 @@ class PoseTable(MutableMapping[int, F64]):
         return node_id in self._rows
 
     def __getitem__(self, node_id: int) -> F64:
-        return self._T[self._rows[node_id]].copy()
+        T: F64 = self._T[self._rows[node_id]].copy()
+        return T
 
     def __setitem__(self, node_id: int, T: F64) -> None:
         """Raises ValueError for a new id that is not above all before it."""
@@ -50,7 +51,8 @@ class PoseTable(MutableMapping[int, F64]):
         rows, is_known = self._find(np.asarray(node_ids, np.int64))
         if not is_known.all():
             raise KeyError(int(np.asarray(node_ids)[~is_known][0]))
-        return self._T[rows]
+        T: F64 = self._T[rows]
+        return T
 
     def assign(self, node_ids: Sequence[int] | I64, T: F64) -> None:
         """Set the poses (N, 4, 4) of those of these nodes that are known."""

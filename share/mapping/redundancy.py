@@ -108,7 +108,7 @@ class TwoNearest:
                 break
             todo, count = todo[~is_certain], 4 * count
         rank = self.distance[rows, 0] + _SECOND_WEIGHT * np.minimum(self.distance[rows, 1], _MAX_SECOND)
-        return np.minimum(rank, _NO_NEIGHBOUR_DISTANCE)
+        return np.asarray(np.minimum(rank, _NO_NEIGHBOUR_DISTANCE))
 
     def remove(self, row: int) -> I64:
         """Remove a pose; return those of which it was a neighbour."""

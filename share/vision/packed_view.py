@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from share.checks import checked_array
+from share.checks import MAX_POSITION_M, checked_array
 from share.geometry.camera import rays
-from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS, MAX_POSITION_M, MAX_UV, U8, View
+from share.types import DESCRIPTOR_BYTES, F64, MAX_KEYPOINTS, MAX_UV, U8, View
 
 _STEPS = 32767  # of a coordinate, to either side
 
@@ -59,7 +59,7 @@ class PackedView:
 
     def unpack(self) -> View:
         """Return the view; points that are too far for one have no depth."""
-        uv = self.uv * self.uv_step
+        uv: F64 = self.uv.astype(np.float64) * self.uv_step
         rho = self.rho.astype(np.float64)
         points = (
             rays(uv) / np.where(rho * MAX_POSITION_M > np.abs(rays(uv)).max(axis=1), rho, np.nan)[:, None]

@@ -108,7 +108,8 @@ def test_the_up_direction(walk, tracked):
 
 
 def test_keyframes_carry_the_motion_by_the_present_state(walk):
-    """The first keyframes are published with a tilt a degree off; its correction is no rotation."""
+    """The first keyframes come while the tilt is a degree off; its correction is no rotation, neither between
+    them nor in the poses that are published."""
     frames, rig, truth = walk
     tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
     for frame in frames:
@@ -121,10 +122,9 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
     published = se3.inverse(published[:-1]) @ published[1:]
     steps = np.array([c.T_previous_body for _, c in shown[1:]])
     sigma = np.sqrt([np.trace(c.cov[:3, :3]) for _, c in shown[1:]])
-    off, before = (se3.rotation_angle(se3.inverse(T) @ true) for T in (steps, published))
-    assert before.max() > 10 * sigma.max()
+    off, shown_off = (se3.rotation_angle(se3.inverse(T) @ true) for T in (steps, published))
     assert (off < 4 * sigma).all()
-    assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
+    assert np.sqrt((shown_off**2).mean()) < 1.5 * np.sqrt((off**2).mean())
 
 
 def test_keyframes_carry_their_pose_relative_to_earlier_ones_by_the_present_state(walk):
@@ -374,18 +374,18 @@ def test_memory_is_bounded(walk):
 def test_predicted_poses_between_frames(walk):
     """Two frames ahead, 133 ms: by the IMU to a few mm, without it as far as a head keeps its ways."""
     frames, _, truth = walk
-    _, _, tracker = run(walk, frames[:40])
+    results, _, tracker = run(walk, frames[:40])
     to = frames[41].stamp_ns
     imu = frames[40].imu.concatenate(frames[41].imu)
     at = {int(t): T for t, T in zip(truth.stamps_ns, truth.T, strict=True)}
     true = se3.inverse(at[frames[39].stamp_ns]) @ at[to]
-    before = tracker.state.T
+    before, state = results[-1].T_odom_body, tracker.state.T.copy()
     for samples, far_rad, far_m in ((imu, 0.003, 0.005), (None, 0.1, 0.03)):
         ahead = tracker.predict(to, samples)
         off = se3.log(se3.inverse(true) @ se3.inverse(before) @ ahead)
         assert np.linalg.norm(off[:3]) < far_rad
         assert np.linalg.norm(off[3:]) < far_m
-    assert (before == tracker.state.T).all()
+    assert (state == tracker.state.T).all()
     assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
 
 

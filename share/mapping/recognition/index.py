@@ -237,8 +237,8 @@ def merge_in_steps(pages: Sequence[IndexPage]) -> Generator[int, None, IndexPage
     sizes = np.concatenate([page.sizes[slots] for page, slots in zip(pages, kept, strict=True)])
     new_slots, first_slot = [], 0
     for page, slots in zip(pages, kept, strict=True):
-        new_slot = np.full(len(page), _DROPPED, np.uint16)
-        new_slot[slots] = np.arange(first_slot, first_slot + len(slots))
+        new_slot: NDArray[np.uint16] = np.full(len(page), _DROPPED, np.uint16)
+        new_slot[slots] = np.arange(first_slot, first_slot + len(slots), dtype=np.uint16)
         new_slots.append(new_slot)
         first_slot += len(slots)
     starts: U32 = np.zeros_like(pages[0].starts)
@@ -246,12 +246,12 @@ def merge_in_steps(pages: Sequence[IndexPage]) -> Generator[int, None, IndexPage
     yield _ENTRIES_PER_STEP // 2  # for the arrays
     filled, bounds = 0, _step_bounds(pages)
     for low, high in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        words, slots = _entries(pages, new_slots, low, high)
+        words, of_block = _entries(pages, new_slots, low, high)
         count = np.bincount(words, minlength=high - low)
-        out[filled : filled + len(slots)] = slots
+        out[filled : filled + len(of_block)] = of_block
         starts[low + 1 : high + 1] = filled + np.cumsum(count)
-        filled += len(slots)
-        yield len(slots)
+        filled += len(of_block)
+        yield len(of_block)
     ids = np.concatenate([page.ids[slots] for page, slots in zip(pages, kept, strict=True)])
     is_alive = np.concatenate([page.is_alive[slots] for page, slots in zip(pages, kept, strict=True)])
     return IndexPage(ids, sizes, is_alive, starts, out)
@@ -260,7 +260,7 @@ def merge_in_steps(pages: Sequence[IndexPage]) -> Generator[int, None, IndexPage
 def _step_bounds(pages: Sequence[IndexPage]) -> I64:
     """Ascending words, the first and last included, between which there are about as many entries as a step
     has."""
-    entries = sum(page.starts.astype(np.int64) for page in pages)
+    entries: I64 = np.sum([page.starts.astype(np.int64) for page in pages], axis=0)
     inner = np.searchsorted(entries, np.arange(_ENTRIES_PER_STEP, entries[-1], _ENTRIES_PER_STEP))
     return np.unique(np.concatenate([[0], inner, [len(entries) - 1]]))
 

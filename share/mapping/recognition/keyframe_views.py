@@ -208,7 +208,7 @@ class KeyframeViews:
             self.index.remove(node_id)
         del self._known[node_id]
         for per_node in (self._images, self._jpegs, self._views, self._decoded, self._undescribed):
-            per_node.pop(node_id, None)  # type: ignore[attr-defined]
+            per_node.pop(node_id, None)
 
     def _keep(self, kept: OrderedDict[int, T], node_id: int, value: T) -> None:
         """Keep the JPEG or view of a keyframe, and forget the one not used for longest if there are many."""
