@@ -334,6 +334,13 @@ class Keyframe:
     earlier: EarlierPoses = field(default_factory=EarlierPoses.empty)
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of its variable arrays."""
+        view, image, earlier = self.view, self.image, self.earlier
+        arrays = (view.uv, view.points, view.descriptors, image.jpeg, image.uv, image.plane, image.rho_sigma)
+        return sum(array.nbytes for array in (*arrays, earlier.ids, earlier.T_earlier_body, earlier.cov))
+
+    @property
     def points(self) -> F32:
         """Known points (N, 3) m, in cam0, NaN rows where depth is unknown."""
         return np.concatenate([self.view.points, self.image.points])
