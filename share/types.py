@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -333,7 +334,7 @@ class Keyframe:
     image: KeyframeImage = field(default_factory=KeyframeImage.empty)
     earlier: EarlierPoses = field(default_factory=EarlierPoses.empty)
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Bytes of its variable arrays."""
         view, image, earlier = self.view, self.image, self.earlier

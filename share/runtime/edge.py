@@ -52,6 +52,7 @@ from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.map_writer import MapWriter
+from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
 from share.runtime.mapper_supervision import MapperProgress, MapperRestarts
 from share.runtime.run_files import EdgeFiles
@@ -162,6 +163,7 @@ class EdgeRun:
             return
         self._closed = True
         if self._mapper_process is not None:
+            self._handover.flush()
             self._mapper_process.close()
         self._handle_answers()
         self._trackers.close()
@@ -222,6 +224,7 @@ class EdgeRun:
         self._mapper_process: WorkerProcess | None = None
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
+        self._handover: KeyframeHandover  # where there is a mapper
         self._state_machine: Edge
         if POLICIES[self._settings.edge.policy].streams_frames:
             self._state_machine = TrackingEdge(
@@ -241,6 +244,7 @@ class EdgeRun:
         )
         if stored_map is not None:
             self._mapper_process.send(RestoreMap(stored_map))
+        self._handover = KeyframeHandover(self._mapper_process.send)
         if store is not None and writable:
             self._map_writer = MapWriter(store, self._post, self._post_map_notice)
 
@@ -273,6 +277,8 @@ class EdgeRun:
                     text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
                     self._other_troubles.add(text)
                     self._handle(tracker)
+                case KeyframesAdded() as added:
+                    self._handover.record_added(added)
                 case MapperReport() as report:
                     self._progress.record(report)
                 case _Notice() as notice:
@@ -321,7 +327,9 @@ class EdgeRun:
         match effect:
             case SendToPeer():
                 self._link.send(effect.peer_id, effect.frames)
-            case AddRun() | SetCredential() | SetPresence() | AddKeyframe() | DropRun() if (
+            case AddKeyframe() if self._mapper_process is not None:
+                self._handover.add(effect)
+            case AddRun() | SetCredential() | SetPresence() | DropRun() if (
                 self._mapper_process is not None
             ):
                 self._mapper_process.send(effect)

@@ -23,7 +23,7 @@ from share import startup  # noqa: E402
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
-from inner_edge import BYE, PLACES, STEP_NS, InnerEdge, PictureAgent, joint_error_m, said  # noqa: E402
+from inner_edge import BYE, PING, PLACES, STEP_NS, InnerEdge, PictureAgent, joint_error_m, said  # noqa: E402
 from keyframe_mutations import mutate_keyframe  # noqa: E402
 from mutations import mutate  # noqa: E402
 from raw_wire import Message  # noqa: E402
@@ -54,9 +54,13 @@ class KeyframeFuzz:
             self._walk()
 
     def run(self, cases: int, work_every: int) -> None:
+        """work_every: cases, after which the mapper has its turn; the honest agents walk on before."""
         for case in range(cases):
-            if case % HONEST_EVERY == 0:
+            if case % (HONEST_EVERY * work_every) == 0:
                 self._walk()
+            elif case % HONEST_EVERY == 0:
+                for agent in self.honest:
+                    self.edge.hear(agent.peer, PING)
             self._attack()
             if case % work_every == 0:
                 self.edge.work(most=30)

@@ -58,6 +58,11 @@ class Fields:
 Change = Callable[[random.Random, Fields], None]
 
 
+def is_keyframe(message: Message) -> bool:
+    """Of the present form: with an image and spans, or empty ones."""
+    return len(message) == 1 + len(ARRAYS)
+
+
 def mutate_keyframe(draw: random.Random, message: Message) -> Message:
     """One mutation of a keyframe; other messages, and what is one no more, as they are."""
     try:
