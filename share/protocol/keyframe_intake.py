@@ -97,7 +97,9 @@ _KEYFRAME_COST = _BASE_COST + _IMAGE_COST + 80 * _SURFACE_COST + 848 * 480 / _PI
 _COST_HZ = _KEYFRAMES_HZ * _KEYFRAME_COST
 _COST_BURST = 700.0 * _KEYFRAME_COST
 _SEGMENT_FACTOR = 28  # a keyframe that starts a segment costs this much more: the mapper never forgets one
-_OVERLOAD_TEXT = f"more than the work of {_KEYFRAMES_HZ:.0f} keyframes a second: further keyframes are deferred"
+_OVERLOAD_TEXT = (
+    f"more than the work of {_KEYFRAMES_HZ:.0f} keyframes a second: further keyframes are deferred"
+)
 _RATE_SLACK = 1.2  # keyframes arrive unevenly
 _RATE_BURST = 10.0  # keyframes
 

@@ -54,7 +54,10 @@ class StepChain:
             return agreed, None
         worst = int(np.where(is_false, distance_m, -1.0).argmax())
         away = f"{distance_m[worst]:.2g} m and {np.degrees(angle_rad[worst]):.2g} degrees"
-        return agreed, f"its pose relative to keyframe {earlier.ids[worst]} is {away} off its steps: without it"
+        return (
+            agreed,
+            f"its pose relative to keyframe {earlier.ids[worst]} is {away} off its steps: without it",
+        )
 
     def _row(self, keyframe_id: int) -> int:
         """Row of a keyframe before the last; -1 if the chain does not have it."""

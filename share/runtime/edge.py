@@ -329,9 +329,7 @@ class EdgeRun:
                 self._link.send(effect.peer_id, effect.frames)
             case AddKeyframe() if self._mapper_process is not None:
                 self._handover.add(effect)
-            case AddRun() | SetCredential() | SetPresence() | DropRun() if (
-                self._mapper_process is not None
-            ):
+            case AddRun() | SetCredential() | SetPresence() | DropRun() if self._mapper_process is not None:
                 self._mapper_process.send(effect)
             case StartTracker() | TrackFrame() | StopTracker():
                 self._trackers.execute(effect)

@@ -84,7 +84,9 @@ def test_a_chain_of_badly_rounded_steps_stays_rigid() -> None:
 def sent(k: int, spans: EarlierPoses, starts: bool = False) -> Keyframe:
     T = power(k)
     reference, T_ref = (-1, T) if starts or not k else (k - 1, STEP)
-    return Keyframe(k, reference, 10**8 * k, T_ref, COV, T, np.zeros(3), 0.0, View.empty(), k - 1, earlier=spans)
+    return Keyframe(
+        k, reference, 10**8 * k, T_ref, COV, T, np.zeros(3), 0.0, View.empty(), k - 1, earlier=spans
+    )
 
 
 def test_the_edge_remembers_the_steps_of_a_run_and_begins_anew_with_a_segment() -> None:

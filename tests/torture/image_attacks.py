@@ -1,10 +1,11 @@
-"""Attacks by keyframes with images: what the edge decodes, aligns and believes of motion. See `attacks.py`."""
+"""Attacks by keyframes with images (see `attacks.py`): what is decoded, aligned and believed of motion."""
 
 from __future__ import annotations
 
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from fuzzer import own_name
@@ -43,7 +44,9 @@ def along_x(x: float, form: str = "d") -> bytes:
     return struct.pack(f"<16{form}", *(x if k == 3 else float(k % 5 == 0) for k in range(16)))
 
 
-def set_spans(fields: Fields, ids: list[int], step_m: float, off_m: float = 0.0, variance: float = 1e-6) -> None:
+def set_spans(
+    fields: Fields, ids: list[int], step_m: float, off_m: float = 0.0, variance: float = 1e-6
+) -> None:
     """Poses relative to these keyframes: by the steps in between, and so far off."""
     own = fields.scalars[ID]
     cov = struct.pack("<36f", *(variance * (k % 7 == 0) for k in range(36)))
@@ -65,13 +68,14 @@ def _said(c: Any, chain: Chain, change: Callable[[Fields], None] | None = None) 
 
 
 def image_bombs(c: Any) -> None:
-    """Small JPEGs that say they are huge, from cameras that are said to be as large, and of the wrong kinds."""
+    """Small JPEGs that say they are huge, of cameras that are said to be as large, and of wrong kinds."""
     while c.going:
         for width, height in SIZES:
             peer = _peer_with_camera(c, width, height)
             chain = Chain(c)
             for form in (_baseline, _progressive, _many_scans, _cut):
-                c.send(peer, [chain.next(lambda f, form=form: form(f, width, height)) for _ in range(4)])
+                change = partial(form, width=width, height=height)
+                c.send(peer, [chain.next(change) for _ in range(4)])
                 time.sleep(PACE_S)
             peer.close()
 

@@ -165,7 +165,9 @@ BACK = (3, 7, 13)  # keyframes to which spans lead, as SHARE's agents send them
 def place(j: int) -> F64:
     """T_world_body (4, 4) of place j: to and fro before the back wall."""
     a = 2 * np.pi * j / PLACES
-    xi = np.array([0.04 * np.sin(2 * a), 0.12 * np.sin(a), 0.0, 0.6 * np.sin(a), 0.1 * np.cos(a), 0.2 * np.cos(a)])
+    xi = np.array(
+        [0.04 * np.sin(2 * a), 0.12 * np.sin(a), 0.0, 0.6 * np.sin(a), 0.1 * np.cos(a), 0.2 * np.cos(a)]
+    )
     return se3.exp(xi) @ se3.inverse(T_BODY_CAM)
 
 

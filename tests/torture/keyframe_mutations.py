@@ -18,14 +18,13 @@ ARRAYS = (
     "T_ref_body", "cov", "T_odom_body", "up", "uv", "points", "descriptors", "jpeg", "surface_uv", "plane",
     "rho_sigma", "ids", "T_earlier_body", "earlier_cov",
 )  # fmt: skip
-ROW_BYTES = dict(uv=8, points=12, descriptors=32, jpeg=1, surface_uv=8, plane=12, rho_sigma=4) | dict(
-    ids=8, T_earlier_body=64, earlier_cov=144
-)
+ROW_BYTES = {"uv": 8, "points": 12, "descriptors": 32, "jpeg": 1, "surface_uv": 8, "plane": 12}
+ROW_BYTES |= {"rho_sigma": 4, "ids": 8, "T_earlier_body": 64, "earlier_cov": 144}
 ID, REFERENCE, STAMP, PREDECESSOR, UP_SIGMA = range(5)  # of the scalars
 SIZES = (0, 1, 7, 8, 480, 640, 641, 2000, 8192, 65_500, 65_535)  # px, that a JPEG's header states
 PNG = b"\x89PNG\r\n\x1a\n"
 FLOATS = (0.0, -0.0, 1e-38, 1e-9, 0.03, 1.0, 50.0, 999.9, 1e3, 1.001e3, 1e5, 1e6, 3e38)
-FLOATS += tuple(-value for value in FLOATS) + (math.nan, math.inf, -math.inf)
+FLOATS = (*FLOATS, *(-value for value in FLOATS), math.nan, math.inf, -math.inf)
 IDS = (0, 1, 2, 63, 10**6, 2**31 - 2, 2**31 - 1, 2**31, 2**62, 2**63 - 1, -1, -(2**63))
 
 
@@ -155,10 +154,7 @@ def _surface_values(draw: random.Random, fields: Fields) -> None:
     fields.set_floats(
         name,
         "f",
-        [
-            value if k % columns == column and draw.random() < share else old
-            for k, old in enumerate(values)
-        ],
+        [value if k % columns == column and draw.random() < share else old for k, old in enumerate(values)],
     )
 
 
@@ -179,7 +175,9 @@ def _surface_count(draw: random.Random, fields: Fields) -> None:
     names = ["surface_uv", "plane", "rho_sigma"]
     for name in names if draw.random() < 0.8 else [draw.choice(names)]:
         data, size = fields.arrays[name], ROW_BYTES[name]
-        fields.arrays[name] = (data * (n // max(1, fields.rows(name)) + 1))[: n * size] if data else bytes(n * size)
+        fields.arrays[name] = (
+            (data * (n // max(1, fields.rows(name)) + 1))[: n * size] if data else bytes(n * size)
+        )
 
 
 # ------------------------------------------------------------------ spans, poses, ids

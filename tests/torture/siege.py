@@ -14,7 +14,16 @@ from harness import EdgeProgram, HonestAgents, Keys, Program, Result, Setup, Wat
 
 SETTLED_S = 3.0  # of the honest agents alone, before anything begins
 RSS_MB = 300.0  # by which all processes of the edge together may grow from the attack's beginning on
-BAD_WORDS = ("JPEG data", "JPEG file", "Traceback", "Warning:", "Assertion failed", "mapper died", "step failed", "write failed")
+BAD_WORDS = (
+    "JPEG data",
+    "JPEG file",
+    "Traceback",
+    "Warning:",
+    "Assertion failed",
+    "mapper died",
+    "step failed",
+    "write failed",
+)
 STEP_MS = 300.0  # median of a kind of step of the mapper
 LONGEST_STEP_MS = 5000.0  # on a machine whose cores others have
 MAP_ERROR_M = 0.1  # of the honest agents' places in one map; some cm without an attack
