@@ -163,7 +163,7 @@ class OdometryBase:
     def steps_to(self, keyframe: Keyframe) -> StepChain:
         """Return the steps up to the next keyframe."""
         steps = StepChain.start(self.id) if self.steps is None else self.steps
-        return steps.extended(keyframe.id, keyframe.T_ref_body)
+        return steps.extended(keyframe.id, keyframe.T_ref_body, keyframe.cov)
 
     def jump_m(self, keyframe: Keyframe) -> float:
         """Return the distance to the keyframe, m, if no agent can move so far in that time, else 0."""

@@ -27,6 +27,7 @@ CAMERA = HELLO.rig.cam0
 SURFACE = Surfaces(np.array([[0.1, 0.2]]), np.array([[0.0, 0.0, 0.5]]), np.array([0.01]))
 RIGHT = SURFACE.with_image(np.zeros((CAMERA.height, CAMERA.width), np.uint8))
 WRONG = SURFACE.with_image(np.zeros((CAMERA.height, CAMERA.width + 8), np.uint8))
+COV = 1e-6 * np.eye(6)
 BASE = OdometryBase(0, 0, np.eye(4))
 
 
@@ -71,7 +72,7 @@ def reaching_back(T: np.ndarray) -> Keyframe:
 
 
 def test_a_keyframe_that_has_to_start_a_segment_loses_its_earlier_poses() -> None:
-    steps = StepChain.start(1).extended(2, np.eye(4)).extended(4, np.eye(4))
+    steps = StepChain.start(1).extended(2, np.eye(4), COV).extended(4, np.eye(4), COV)
     base = OdometryBase(4, 4 * 10**8, np.eye(4), steps)
     got, problem = sanitise(reaching_back(far()), base, CAMERA)
     assert problem == "keyframe 5 is 50 m from the previous one: new segment"

@@ -14,7 +14,7 @@ from raw_wire import Message, pack, unpack
 
 STEP_NS = 300_000_000
 SIZES = ((640, 480), (1920, 1200), (2000, 2000), (8192, 8192), (65_500, 65_500))  # px that headers state
-MOST_SURFACES, MOST_SPANS = 256, 32
+MOST_SURFACES, MOST_SPANS = 256, 8
 PACE_S = 0.08  # between keyframes: as many as a name may send
 
 
