@@ -51,8 +51,8 @@ from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.guarded_tracker import FaultGuard
-from share.runtime.map_writer import MapWriter
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
+from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
 from share.runtime.mapper_supervision import MapperProgress, MapperRestarts
 from share.runtime.run_files import EdgeFiles
