@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from share.checks import MAX_ODOM_M, check_covs, checked_array, checked_pose
 
-MAX_EARLIER = 8  # keyframes to which a keyframe's pose is given; a tracker gives three
+MAX_EARLIER = 32  # keyframes to which a tracker gives a candidate's pose
+MAX_SPANS = 8  # of them, in a keyframe that is sent; agents send three
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from share.checks import (
     checked_stamp,
     checked_up,
 )
-from share.earlier_poses import EarlierPoses
+from share.earlier_poses import MAX_SPANS, EarlierPoses
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -349,6 +349,8 @@ class Keyframe:
     def __post_init__(self) -> None:
         checked_id("id", self.id)
         checked_stamp("stamp_ns", self.stamp_ns)
+        if len(self.earlier) > MAX_SPANS:
+            raise ValueError(f"earlier: {len(self.earlier)} keyframes, at most {MAX_SPANS}")
         if len(self.earlier) and not 0 <= self.earlier.ids.min() <= self.earlier.ids.max() < self.id:
             raise ValueError(f"earlier: ids must lie in 0 .. {self.id - 1}")
         if not -1 <= self.reference < self.id:
