@@ -94,12 +94,18 @@ def checked_cov(name: str, value: ArrayLike) -> NDArray[np.float64]:
     """Return `value` as a read-only covariance (6, 6). Raises ValueError unless symmetric and positive
     semidefinite: another one would stop the solver for the whole map."""
     cov = checked_array(name, value, (6, 6), np.float64)
-    size = np.abs(cov).max()
-    if size > 1e12 or np.abs(cov - cov.T).max() > 1e-6 * size:
-        raise ValueError(f"{name}: is not symmetric, or exceeds 1e12")
-    if size and np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
-        raise ValueError(f"{name}: has a negative variance")
+    check_covs(name, cov[None])
     return cov
+
+
+def check_covs(name: str, covs: NDArray[np.float64]) -> None:
+    """Raise ValueError unless all covariances (N, 6, 6), finite, are as `checked_cov` wants them."""
+    sizes = np.abs(covs).max(axis=(1, 2), initial=0.0)
+    asymmetries = np.abs(covs - covs.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+    if (sizes > 1e12).any() or (asymmetries > 1e-6 * sizes).any():
+        raise ValueError(f"{name}: is not symmetric, or exceeds 1e12")
+    if sizes.any() and (np.linalg.eigvalsh(covs)[:, 0] < -1e-9 * sizes).any():
+        raise ValueError(f"{name}: has a negative variance")
 
 
 def checked_sigma(name: str, value: float) -> float:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from share.checks import MAX_ODOM_M, checked_array, checked_cov, checked_pose
+from share.checks import MAX_ODOM_M, check_covs, checked_array, checked_pose
 
-MAX_EARLIER = 32  # keyframes to which a keyframe's pose is given
+MAX_EARLIER = 32  # keyframes to which a tracker gives a candidate's pose
+MAX_SPANS = 8  # of them, in a keyframe that is sent; agents send three
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +39,9 @@ class EarlierPoses:
             raise ValueError("earlier: a keyframe occurs twice")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        for T, cov in zip(self.T_earlier_body, self.cov, strict=True):
+        for T in self.T_earlier_body:
             checked_pose("T_earlier_body", T, MAX_ODOM_M)
-            checked_cov("earlier.cov", cov)
+        check_covs("earlier.cov", self.cov.astype(np.float64))
 
     def __len__(self) -> int:
         return len(self.ids)

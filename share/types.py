@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from share.checks import (
     checked_stamp,
     checked_up,
 )
-from share.earlier_poses import EarlierPoses
+from share.earlier_poses import MAX_SPANS, EarlierPoses
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -333,6 +334,13 @@ class Keyframe:
     image: KeyframeImage = field(default_factory=KeyframeImage.empty)
     earlier: EarlierPoses = field(default_factory=EarlierPoses.empty)
 
+    @cached_property
+    def nbytes(self) -> int:
+        """Bytes of its variable arrays."""
+        view, image, earlier = self.view, self.image, self.earlier
+        arrays = (view.uv, view.points, view.descriptors, image.jpeg, image.uv, image.plane, image.rho_sigma)
+        return sum(array.nbytes for array in (*arrays, earlier.ids, earlier.T_earlier_body, earlier.cov))
+
     @property
     def points(self) -> F32:
         """Known points (N, 3) m, in cam0, NaN rows where depth is unknown."""
@@ -341,6 +349,8 @@ class Keyframe:
     def __post_init__(self) -> None:
         checked_id("id", self.id)
         checked_stamp("stamp_ns", self.stamp_ns)
+        if len(self.earlier) > MAX_SPANS:
+            raise ValueError(f"earlier: {len(self.earlier)} keyframes, at most {MAX_SPANS}")
         if len(self.earlier) and not 0 <= self.earlier.ids.min() <= self.earlier.ids.max() < self.id:
             raise ValueError(f"earlier: ids must lie in 0 .. {self.id - 1}")
         if not -1 <= self.reference < self.id:

@@ -235,14 +235,16 @@ class Mapper:
         """Find the ORB features of a keyframe that came as an image only."""
         if (image := self._views.undescribed_image(node_id)) is None:
             return
+        key = self.atlas.key(node_id)
         try:
             view = yield DescribeStep(node_id, image)
         except Exception:
             self._views.describe(node_id, View.empty())  # else it would be tried for ever
             raise
         if (packed := self._views.describe(node_id, view)) is not None and len(packed):
-            self._changes.append(SaveView(self.atlas.key(node_id), packed))
-        yield []
+            self._changes.append(SaveView(key, packed))
+        damaged = f"keyframe {key.id}: its image is damaged: without it"
+        yield [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", damaged)]
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""

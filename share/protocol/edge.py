@@ -191,8 +191,7 @@ class Edge:
             if not self._admission.is_name_stale(hello.name, self._registry, self._now_ns):
                 self._refuse(event.peer_id, reason)
             return
-        peer = self._registry.get(event.peer_id) or self._join(event, hello)
-        self._welcome(peer)
+        self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
         return self._admission.objection(event, hello, self._registry, self._now_ns)
@@ -273,12 +272,11 @@ class Edge:
 
     def _forget(self, peer: Peer) -> None:
         """Remove a run and its state for good."""
-        was_latest = self._registry.forget(peer)
-        self._effects.append(ed.DropRun(peer.key))
-        if was_latest:
+        if self._registry.forget(peer):  # it was the latest of its name
             self._rate_scheduler.forget(peer.name)
+        self._effects.append(ed.DropRun(peer.key))
 
-    # ------------------------------------------------------------------ keyframes
+    # ------------------------------------------------------------------ keyframes and the map
 
     def _on_keyframe(self, peer: Peer, keyframe: Keyframe) -> None:
         applicable = self._reorder(peer, keyframe)
@@ -293,7 +291,7 @@ class Edge:
     def _reorder(self, peer: Peer, keyframe: Keyframe) -> list[Keyframe]:
         """Return the keyframes that can be applied now; none if the agent exceeds its quota."""
         if peer.reorder_buffer.is_new(keyframe.id):  # duplicates cost nothing
-            reason = peer.overload_reason or self._quota.objection(peer.name, keyframe, self._now_ns)
+            reason = peer.overload_reason or self._quota.objection(peer.hello, keyframe, self._now_ns)
             if reason is not None:
                 peer.refusals.add(reason, self._now_ns)
                 peer.overload.add(reason, self._now_ns)
@@ -311,14 +309,17 @@ class Edge:
             self._count_bad_message(peer, str(error))
             return
         if problem:
-            peer.suspect_keyframes.add(problem, self._now_ns)
-            self._record("odometry suspect", peer, problem)
+            self._suspect(peer, problem)
         # a run is stored with its first keyframe
         run = (SaveRun(peer.key, peer.hello, peer.credential),) if peer.odometry_base is None else ()
-        peer.odometry_base = OdometryBase.from_keyframe(keyframe)
+        peer.odometry_base = OdometryBase.from_keyframe(keyframe, peer.odometry_base)
         self._save(*run, SaveKeyframe(peer.key, keyframe))
         is_over_rate = self._quota.is_over_rate(peer.name, self._now_ns)
         self._effects.append(ed.AddKeyframe(peer.key, keyframe, is_over_rate))
+
+    def _suspect(self, peer: Peer, problem: str) -> None:
+        peer.suspect_keyframes.add(problem, self._now_ns)
+        self._record("odometry suspect", peer, problem)
 
     def _save(self, *changes: MapChange) -> None:
         if (effect := self._durability.save(changes)) is not None:
@@ -329,14 +330,14 @@ class Edge:
         for peer in peers:
             self._send(peer.id, peer.reorder_buffer.ack(peer.durable_below))
 
-    # ------------------------------------------------------------------ the map
-
     def _on_finding(self, finding: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
         if finding.agent is None:
             self._record(finding.event, None, finding.reason, map_id=finding.map_id)
         elif (peer := self._registry.by_key.get(finding.agent)) is None:
             return  # forgotten in the meantime
+        elif finding.event == "odometry suspect":
+            self._suspect(peer, finding.reason)
         elif finding.correction is None:
             self._record(finding.event, peer, finding.reason, finding.event == "step failed")
         else:
@@ -366,8 +367,7 @@ class Edge:
     ) -> None:
         """Record an event. throttled: unless it is repeated too often, as a peer could cause it."""
         make = self._event_log.throttled_event if throttled else self._event_log.event
-        effect = make(self._now_ns, event, peer.name if peer else None, reason, **fields)
-        if effect is not None:
+        if (effect := make(self._now_ns, event, peer.name if peer else None, reason, **fields)) is not None:
             self._effects.append(effect)
 
     def series(self) -> dict[str, Any]:

@@ -11,14 +11,15 @@ import numpy as np
 from share.earlier_poses import EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.mapping.recognition.patch_alignment import ORB_FEATURES
+from share.protocol.step_chain import StepChain
 from share.timing import SECOND_NS, TokenBuckets
 from share.types import F64, Keyframe
 from share.vision.keyframe_images import image_objection
-from share.wire.messages import MAX_BUFFERED, Ack
+from share.wire.messages import MAX_BUFFERED, Ack, Hello
 
 MAX_ID_GAP = 1_000_000  # ids that an agent may have dropped since the last one: two days at 5 Hz
 _CAPACITY = 64  # keyframes of one run that wait for a predecessor
+_CAPACITY_BYTES = 1_250_000  # of their arrays: 16 of the largest, as many as an agent has in flight
 
 
 class ReorderBuffer:
@@ -62,10 +63,13 @@ class ReorderBuffer:
             ready.append(applicable)
             self.next_keyframe = applicable.id + 1
             self._waiting = {k: v for k, v in self._waiting.items() if k > applicable.id}
-        if len(self._waiting) > self._capacity:
+        while len(self._waiting) > self._capacity or self._waiting_bytes() > _CAPACITY_BYTES:
             del self._waiting[max(self._waiting)]  # drop_newest: the agent resends it
             self.evicted += 1
         return ready
+
+    def _waiting_bytes(self) -> int:
+        return sum(keyframe.nbytes for keyframe in self._waiting.values())
 
     def ack(self, durable_below: int | None = None) -> Ack:
         """Return the answer to any keyframe, duplicates too: their acknowledgement may have been lost.
@@ -83,20 +87,29 @@ class ReorderBuffer:
 
 # Keyframe quota: the mapper work that one agent may cause, over all its runs.
 #
-# The work grows with the keypoints; a keyframe without any costs as much as _BASE_COST of them
-# (docs/understand/robustness.md). With the default settings an agent sends keyframes with an image, at most 5
-# a second (control.rate_max_hz), and resends up to 600 at once to a new edge. Twice that rate and 700 at once
-# are accepted.
-_BASE_COST = 250
-_IMAGE_KEYPOINTS = ORB_FEATURES  # that the edge finds in an image
-_KEYFRAME_COST = _IMAGE_KEYPOINTS + _BASE_COST
-_COST_HZ = 10.0 * _KEYFRAME_COST
+# The work grows with the keypoints, or with an image's pixels and surfaces; a keyframe without any costs as
+# much as _BASE_COST keypoints (docs/understand/robustness.md). With the default settings an agent sends
+# keyframes with an image, at most 5 a second (control.rate_max_hz), and resends up to 600 at once to a new
+# edge. Twice that rate and 700 at once are accepted, of images of 848x480 px with 80 surfaces.
+_BASE_COST, _IMAGE_COST, _SURFACE_COST, _PIXELS_PER_COST = 250.0, 500.0, 2.0, 3000.0
+_KEYFRAMES_HZ = 10.0
+_KEYFRAME_COST = _BASE_COST + _IMAGE_COST + 80 * _SURFACE_COST + 848 * 480 / _PIXELS_PER_COST
+_COST_HZ = _KEYFRAMES_HZ * _KEYFRAME_COST
 _COST_BURST = 700.0 * _KEYFRAME_COST
 _SEGMENT_FACTOR = 28  # a keyframe that starts a segment costs this much more: the mapper never forgets one
-_KEYPOINTS_HZ = _COST_HZ / _KEYFRAME_COST * _IMAGE_KEYPOINTS
-_OVERLOAD_TEXT = f"more than {_KEYPOINTS_HZ:.0f} keypoints a second: further keyframes are deferred"
+_OVERLOAD_TEXT = (
+    f"more than the work of {_KEYFRAMES_HZ:.0f} keyframes a second: further keyframes are deferred"
+)
 _RATE_SLACK = 1.2  # keyframes arrive unevenly
 _RATE_BURST = 10.0  # keyframes
+
+
+def _cost(keyframe: Keyframe, camera: Camera) -> float:
+    image = keyframe.image
+    cost = _BASE_COST + len(keyframe.view) + _SURFACE_COST * len(image.uv)
+    if len(image.jpeg):
+        cost += _IMAGE_COST + camera.width * camera.height / _PIXELS_PER_COST
+    return cost * (1 if keyframe.reference >= 0 else _SEGMENT_FACTOR)
 
 
 class KeyframeQuota:
@@ -110,11 +123,11 @@ class KeyframeQuota:
             _RATE_BURST, None if max_rate_hz is None else _RATE_SLACK * max_rate_hz
         )
 
-    def objection(self, name: str, keyframe: Keyframe, now_ns: int) -> str | None:
-        """Return why this keyframe is not accepted now; None if it is, and charge its cost."""
-        keypoints = len(keyframe.view) + (_IMAGE_KEYPOINTS if len(keyframe.image.jpeg) else 0)
-        cost = (keypoints + _BASE_COST) * (1 if keyframe.reference >= 0 else _SEGMENT_FACTOR)
-        return None if self._cost_buckets.bucket(name, now_ns).take(now_ns, cost=cost) else _OVERLOAD_TEXT
+    def objection(self, hello: Hello, keyframe: Keyframe, now_ns: int) -> str | None:
+        """Return why this keyframe is not accepted now; None if it is, and charge its cost. hello: of its
+        run."""
+        cost, bucket = _cost(keyframe, hello.rig.cam0), self._cost_buckets.bucket(hello.name, now_ns)
+        return None if bucket.take(now_ns, cost=cost) else _OVERLOAD_TEXT
 
     def is_over_rate(self, name: str, now_ns: int) -> bool:
         """Return whether this accepted keyframe exceeds the highest rate that an agent may have."""
@@ -133,15 +146,24 @@ _MAX_VARIANCE = 100.0  # rad^2, m^2: as good as unknown; more would make the sol
 
 @dataclass(frozen=True, eq=False)
 class OdometryBase:
-    """The newest applied keyframe: its id, its stamp, and T_odom_body (4, 4)."""
+    """The newest applied keyframe: its id, its stamp, T_odom_body (4, 4), and the steps that led to it; None
+    where those are not known."""
 
     id: int
     stamp_ns: int
     T_odom_body: F64
+    steps: StepChain | None = None
 
     @classmethod
-    def from_keyframe(cls, keyframe: Keyframe) -> OdometryBase:
-        return cls(keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body)
+    def from_keyframe(cls, keyframe: Keyframe, base: OdometryBase | None = None) -> OdometryBase:
+        """base: the run's keyframe before."""
+        steps = None if base is None or keyframe.reference < 0 else base.steps_to(keyframe)
+        return cls(keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body, steps)
+
+    def steps_to(self, keyframe: Keyframe) -> StepChain:
+        """Return the steps up to the next keyframe."""
+        steps = StepChain.start(self.id) if self.steps is None else self.steps
+        return steps.extended(keyframe.id, keyframe.T_ref_body, keyframe.cov)
 
     def jump_m(self, keyframe: Keyframe) -> float:
         """Return the distance to the keyframe, m, if no agent can move so far in that time, else 0."""
@@ -166,8 +188,9 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
     """Return the next keyframe of a run as the map accepts it, and what was wrong with it, None if nothing.
 
     base: the run's keyframe before; camera: its cam0. A keyframe with an implausible jump, or with a motion
-    that contradicts its two poses, starts a segment in the same odom. An excessive covariance is bounded. An
-    image that cannot be this camera's is dropped. Raises ValueError if its reference is not `base`.
+    that contradicts its two poses, starts a segment in the same odom. Poses relative to earlier keyframes
+    that contradict its steps are dropped, as is an image that cannot be this camera's. An excessive
+    covariance is bounded. Raises ValueError if its reference is not `base`.
     """
     problems = []
     if objection := image_objection(keyframe.image, camera):
@@ -180,6 +203,10 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
             problems.append(f"{reason}: new segment")
             earlier = EarlierPoses.empty()
             keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=earlier)
+        else:
+            earlier, problem = base.steps_to(keyframe).agreeing(keyframe.earlier)
+            problems += [] if problem is None else [f"keyframe {keyframe.id}: {problem}"]
+            keyframe = keyframe if earlier is keyframe.earlier else replace(keyframe, earlier=earlier)
     if (variance := float(keyframe.cov.diagonal().max())) > _MAX_VARIANCE:
         problems.append(f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown")
         keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / variance))

@@ -50,6 +50,7 @@ from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.guarded_tracker import FaultGuard
+from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
 from share.runtime.mapper_supervision import MapperProgress, MapperRestarts
@@ -161,6 +162,7 @@ class EdgeRun:
             return
         self._closed = True
         if self._mapper_process is not None:
+            self._handover.flush()
             self._mapper_process.close()
         self._handle_answers()
         self._trackers.close()
@@ -221,6 +223,7 @@ class EdgeRun:
         self._mapper_process: WorkerProcess | None = None
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
+        self._handover: KeyframeHandover  # where there is a mapper
         self._state_machine: Edge
         if POLICIES[self._settings.edge.policy].streams_frames:
             self._state_machine = TrackingEdge(
@@ -240,6 +243,7 @@ class EdgeRun:
         )
         if restore is not None:
             self._mapper_process.send(restore)
+        self._handover = KeyframeHandover(self._mapper_process.send)
         if store is not None and writable:
             self._map_writer = MapWriter(store, self._post, self._post_map_notice)
 
@@ -272,6 +276,8 @@ class EdgeRun:
                     text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
                     self._other_troubles.add(text)
                     self._handle(tracker)
+                case KeyframesAdded() as added:
+                    self._handover.record_added(added)
                 case MapperReport() as report:
                     self._progress.record(report)
                 case _Notice() as notice:
@@ -320,9 +326,9 @@ class EdgeRun:
         match effect:
             case SendToPeer():
                 self._link.send(effect.peer_id, effect.frames)
-            case AddRun() | SetCredential() | SetPresence() | AddKeyframe() | DropRun() if (
-                self._mapper_process is not None
-            ):
+            case AddKeyframe() if self._mapper_process is not None:
+                self._handover.add(effect)
+            case AddRun() | SetCredential() | SetPresence() | DropRun() if self._mapper_process is not None:
                 self._mapper_process.send(effect)
             case StartTracker() | TrackFrame() | StopTracker():
                 self._trackers.execute(effect)

@@ -18,6 +18,7 @@ from share.mapping.mapper import Mapper
 from share.mapping.steps import SolveStep
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
 from share.protocol.keyframe_intake import FairQueue
+from share.runtime.keyframe_handover import KeyframesAdded
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 from share.startup import HeapTrimmer
 from share.store.keyframe_archive import KeyframeArchive
@@ -85,8 +86,8 @@ def run_mapper(
     inbox: Inbox, answer: Callable[[Any], None], settings: Config, map_file: Path | None = None
 ) -> None:
     """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe and
-    DropRun until END; answers MapperResult, MapperReport, MapRestored and SolverDied. map_file: where images
-    and views are read."""
+    DropRun until END; answers KeyframesAdded, MapperResult, MapperReport, MapRestored and SolverDied.
+    map_file: where images and views are read."""
     _MapperProcess(inbox, answer, settings, None if map_file is None else KeyframeArchive(map_file)).run()
 
 
@@ -170,13 +171,16 @@ class _MapperProcess:
 
     def _add_keyframes(self) -> None:
         """Add waiting keyframes as far as the queue's time budget allows; at the end all of them."""
-        start_s = time.perf_counter()
+        start_s, added = time.perf_counter(), 0
         while True:
             spent_ms = 0.0 if self._is_ended else 1e3 * (time.perf_counter() - start_s)
             if (add := self._keyframe_queue.take_next(spent_ms)) is None:
-                return
+                break
+            added += 1
             work = partial(self._mapper.add_keyframe, add.key, add.keyframe, add.is_over_rate)
             self._findings += self._guarded("keyframe", work, [], add.key)
+        if added:
+            self._answer(KeyframesAdded(added))
 
     def _guarded(self, step: str, work: Callable[[], T], default: T, agent: str | None = None) -> T:
         """Return `work()`, or `default` if it fails. A failure must not end the process: the map file would

@@ -12,6 +12,7 @@ from share.checks import MAX_SIGMA
 from share.errors import DataError
 from share.geometry.camera import Camera, rays
 from share.types import F64, MAX_JPEG_BYTES, MAX_PLANE, MAX_SURFACES, MAX_UV, U8, KeyframeImage
+from share.vision.decoder_complaints import with_complaints
 from share.vision.image_codec import check_complete, checked_header, decode_gray, encode_jpeg, image_format
 
 MAX_IMAGE_PIXELS = 2_400_000  # of a keyframe's image: 1920 x 1200; larger ones cost the edge too much
@@ -78,7 +79,8 @@ def decompress(image: KeyframeImage, camera: Camera) -> U8 | None:
     if not len(image.jpeg) or image_objection(image, camera) is not None:
         return None
     try:
-        decoded = decode_gray(image.jpeg.tobytes(), "image")
+        decoded, complaints = with_complaints(lambda: decode_gray(image.jpeg.tobytes(), "image"))
     except DataError:
         return None
-    return decoded if decoded.shape == (camera.height, camera.width) else None
+    is_intact = not complaints and decoded.shape == (camera.height, camera.width)
+    return decoded if is_intact else None

@@ -21,7 +21,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from share.checks import MAX_STAMP_NS, checked_id, checked_stamp
-from share.earlier_poses import MAX_EARLIER, EarlierPoses
+from share.earlier_poses import MAX_SPANS, EarlierPoses
 from share.errors import VersionError, WireError, printable
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
@@ -269,9 +269,9 @@ _LAYOUTS: dict[type, _Layout] = {
         _Array("image.uv", "<f4", (None, 2), max_length=MAX_SURFACES, key="feature_uv"),
         _Array("image.plane", "<f4", (None, 3), max_length=MAX_SURFACES),
         _Array("image.rho_sigma", "<f4", (None,), max_length=MAX_SURFACES),
-        _Array("earlier.ids", "<i8", (None,), max_length=MAX_EARLIER),
-        _Array("earlier.T_earlier_body", "<f4", (None, 4, 4), max_length=MAX_EARLIER),
-        _Array("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_EARLIER, key="earlier_cov"),
+        _Array("earlier.ids", "<i8", (None,), max_length=MAX_SPANS),
+        _Array("earlier.T_earlier_body", "<f4", (None, 4, 4), max_length=MAX_SPANS),
+        _Array("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_SPANS, key="earlier_cov"),
         **_KEYFRAME_SCALARS,
     ),
     m.Evaluation: _Layout(4, m.Evaluation, keyframe=Int64, delay_ms=float, error_cm=float | None),

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from share.agent_names import checked_name
 from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, MAX_STAMP_NS
-from share.earlier_poses import MAX_EARLIER, EarlierPoses
+from share.earlier_poses import MAX_SPANS, EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import (
     BASELINE_RANGE_M,
@@ -83,7 +83,7 @@ def keyframe_images(draw: st.DrawFn, most: int = 40) -> KeyframeImage:
 
 @st.composite
 def earlier_poses(draw: st.DrawFn, below: int) -> EarlierPoses:
-    n = draw(st.integers(0, min(below, MAX_EARLIER)))
+    n = draw(st.integers(0, min(below, MAX_SPANS)))
     rng = np.random.default_rng(draw(st.integers(0, 99)))
     A = rng.normal(size=(n, 6, 6))
     T = [draw(poses(MAX_ODOM_M / 2)) if k == 0 else se3.exp(rng.normal(size=6)) for k in range(n)]

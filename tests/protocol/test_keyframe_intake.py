@@ -11,9 +11,11 @@ from helpers.hellos import hello_of
 from share.config import Config
 from share.earlier_poses import EarlierPoses
 from share.geometry.camera import Camera
+from share.mapping.corrections import MapEvent
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
 from share.protocol.keyframe_intake import OdometryBase, sanitise
+from share.protocol.step_chain import StepChain
 from share.types import Keyframe, KeyframeImage, View
 from share.vision.image_codec import encode_jpeg
 from share.vision.keyframe_images import Surfaces
@@ -25,6 +27,7 @@ CAMERA = HELLO.rig.cam0
 SURFACE = Surfaces(np.array([[0.1, 0.2]]), np.array([[0.0, 0.0, 0.5]]), np.array([0.01]))
 RIGHT = SURFACE.with_image(np.zeros((CAMERA.height, CAMERA.width), np.uint8))
 WRONG = SURFACE.with_image(np.zeros((CAMERA.height, CAMERA.width + 8), np.uint8))
+COV = 1e-6 * np.eye(6)
 BASE = OdometryBase(0, 0, np.eye(4))
 
 
@@ -69,7 +72,8 @@ def reaching_back(T: np.ndarray) -> Keyframe:
 
 
 def test_a_keyframe_that_has_to_start_a_segment_loses_its_earlier_poses() -> None:
-    base = OdometryBase(4, 4 * 10**8, np.eye(4))
+    steps = StepChain.start(1).extended(2, np.eye(4), COV).extended(4, np.eye(4), COV)
+    base = OdometryBase(4, 4 * 10**8, np.eye(4), steps)
     got, problem = sanitise(reaching_back(far()), base, CAMERA)
     assert problem == "keyframe 5 is 50 m from the previous one: new segment"
     assert (got.reference, len(got.earlier)) == (-1, 0)
@@ -112,3 +116,17 @@ def test_a_header_larger_than_any_camera_is_not_decoded() -> None:
     camera = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
     got, problem = sanitise(keyframe(1, replace(RIGHT, jpeg=bomb)), BASE, camera)
     assert problem is not None and "65500x65500" in problem and len(got.image.jpeg) == 0
+
+
+def test_a_suspicion_of_the_mapper_counts_as_one_of_the_intake() -> None:
+    """It alone decodes images."""
+    edge = Edge(Config(), 7)
+    frames = [bytes(frame) for frame in encode(HELLO)]
+    effects = edge.handle(ed.PeerMessageReceived(m.peer_id(HELLO.run_id), frames), 0)
+    (key,) = (effect.key for effect in effects if isinstance(effect, ed.AddRun))
+    found = MapEvent(key, "odometry suspect", "keyframe 3: its image is damaged: without it")
+    records = [edge.handle(ed.MapperResult((found,)), k) for k in range(500)]
+    written = [effect for effects in records for effect in effects if isinstance(effect, ed.WriteEvent)]
+    assert 0 < len(written) < 50
+    ann = edge.report({})["agents"]["ann"]
+    assert (ann["suspect_keyframes"], ann["last_suspicion"]) == (500, found.reason)

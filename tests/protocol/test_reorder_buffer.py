@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from share.protocol.keyframe_intake import ReorderBuffer
-from share.types import Keyframe, View
+from share.types import MAX_JPEG_BYTES, MAX_SURFACES, Keyframe, KeyframeImage, View
 from share.wire.messages import Ack
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
@@ -96,3 +98,15 @@ def test_the_buffer_is_bounded() -> None:
     assert book.ack() == Ack(0, (1, 2, 3, 4))
     assert book.evicted == 5
     assert ids(book.push(keyframe(0))) == [0, 1, 2, 3, 4]
+
+
+def test_waiting_keyframes_are_bounded_in_bytes() -> None:
+    """More of those with the largest image and most surfaces than an agent has in flight."""
+    none = np.zeros((MAX_SURFACES, 3), np.float32)
+    jpeg = np.zeros(MAX_JPEG_BYTES, np.uint8)
+    image = KeyframeImage(jpeg, none[:, :2], none, none[:, 0])
+    buffer = ReorderBuffer()
+    for k in range(1, 64):
+        buffer.push(replace(keyframe(k), image=image))
+    assert buffer.ack().buffered == tuple(range(1, 17 + 1))
+    assert buffer.evicted == 63 - 17

@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from corpus import Corpus
 from fuzzer import CurvePeer, _small, own_name
+from image_attacks import IMAGE_ATTACKS
 from raw_wire import GREETING, LONG, MORE, Message, RawPeer, dial, frame, pack, ready, unpack
 
 Counts = dict[str, Any]
@@ -449,6 +450,7 @@ ATTACKS: dict[str, Callable[[Ctx], None]] = {
         http_garbage,
     )
 }  # fmt: skip
+ATTACKS |= IMAGE_ATTACKS
 ATTACKS |= {f"flood-{kind}": flood(kind) for kind in ("ping", "pose", "evaluation", "keyframe")}
 
 

@@ -13,6 +13,7 @@ import json
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
@@ -29,10 +30,14 @@ from helpers import crowd  # noqa: E402
 from helpers.edge_sim import Person, walls  # noqa: E402
 from raw_wire import unpack  # noqa: E402
 
+from share.geometry import se3  # noqa: E402
 from share.net.transport import AgentLink, connect  # noqa: E402
+from share.protocol import agent_events as ev  # noqa: E402
+from share.types import F64  # noqa: E402
 from share.wire.messages import public_tag  # noqa: E402
 
 NAMES = ("hope", "faith")
+NEWEST = 10  # keyframes of each, whose places in the map are compared with the truth
 CHUNK = 300  # frames made ahead
 
 
@@ -105,7 +110,28 @@ class Watched:
 
 
 class Honest(crowd.Walker):
-    """As `Walker`; and it can be asked what it met with."""
+    """As `Walker`; and it can be asked what it met with.
+
+    placed: of its newest keyframes, the map, and where they are there and in truth."""
+
+    def __init__(self, person: Person, script: crowd.Script, address: str) -> None:
+        super().__init__(person.hello, script, address)
+        self._person = person
+        self.placed: deque[tuple[str, F64, F64]] = deque(maxlen=NEWEST)
+        handle = self.machine.handle
+
+        def watched(event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
+            effects = handle(event, now_ns)
+            if isinstance(event, ev.FrameTracked) and event.is_keyframe:
+                for effect in effects:
+                    if isinstance(effect, ev.LocalisedPose) and effect.T_map_odom is not None:
+                        self._place(str(effect.map_id), effect.T_map_odom @ effect.T_odom_body)
+            return effects
+
+        self.machine.handle = watched  # type: ignore[method-assign]
+
+    def _place(self, map_id: str, T_map_body: F64) -> None:
+        self.placed.append((map_id, T_map_body[:3, 3], self._person.T_world_body[-1][:3, 3]))
 
     def figures(self) -> dict[str, Any]:
         link = self.link
@@ -127,6 +153,16 @@ class Honest(crowd.Walker):
         }
 
 
+def joint_error_m(agents: list[Honest]) -> float:
+    """RMSE of where both were told to be, in one alignment with the truth; inf unless that is one map."""
+    placed = [row for agent in agents for row in list(agent.placed)]
+    if len({row[0] for row in placed}) != 1 or not all(agent.placed for agent in agents):
+        return float("inf")
+    found, true = (np.array([row[k] for row in placed]) for k in (1, 2))
+    off = se3.transform(se3.umeyama(found, true), found) - true
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
 def main() -> None:
     address, frames = sys.argv[1], int(sys.argv[2])
     keys = None
@@ -139,7 +175,7 @@ def main() -> None:
     agents = []
     for i, name in enumerate(NAMES):
         person = Person(name, place, 0.5 * i, int(time.time_ns() % 2**40) + i)
-        agents.append(Honest(person.hello, Endless(person, frames), address))
+        agents.append(Honest(person, Endless(person, frames), address))
 
     def watched(to: str, run_id: int) -> Watched:
         (agent,) = [a for a in agents if a._run_id == run_id]
@@ -156,7 +192,12 @@ def main() -> None:
     print("welcomed", file=sys.stderr, flush=True)
     for agent in agents:
         agent.join()
-    print(json.dumps([agent.figures() for agent in agents]))
+    print(_told(agents))
+
+
+def _told(agents: list[Honest]) -> str:
+    error_m = joint_error_m(agents)
+    return json.dumps([{**agent.figures(), "joint_error_m": error_m} for agent in agents])
 
 
 def _note(acks: TextIO, line: str, number: int) -> None:
@@ -171,7 +212,7 @@ def _finish_when_told(agents: list[Honest]) -> None:
     for agent in agents:
         agent.join(max(0.0, deadline - time.monotonic()))
     if any(agent.is_alive() for agent in agents):
-        print(json.dumps([agent.figures() for agent in agents]), flush=True)
+        print(_told(agents), flush=True)
         import os
 
         os._exit(0)

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
+from keyframe_mutations import is_keyframe, mutate_keyframe
 from raw_wire import Message, Raw, pack, unpack
 
 INTS = [
@@ -46,7 +47,7 @@ TEXTS += ["‮evil", "é" * 64, "\ud7ff" * 64, "<script>alert(1)</script>", "%s%
 DTYPES = ["<f8", "<f4", "<i8", "|u1", "|O", ">f8", "<U9999", "", "\x00"]
 DIMS = [0, 1, 3, 4, 32, 2000, 2001, 8192, 2**31, 2**63 - 1, 2**64 - 1, -1]
 LEFT_BE = 0.04  # the share that is a replay as it was
-MOST_PARTS = 9  # in a message: with more, its connection ends
+MOST_PARTS = 17  # in a message: with more, its connection ends
 BEYOND = 0.0005  # the share that may have more
 
 
@@ -54,8 +55,9 @@ def mutate(draw: random.Random, message: Message) -> Message:
     """One to three mutations of a copy."""
     if draw.random() < LEFT_BE:
         return list(message)
+    changes = _OF_KEYFRAMES if is_keyframe(message) else _ALL
     for _ in range(draw.choice((1, 1, 1, 2, 3))):
-        message = draw.choice(_ALL)(draw, message)
+        message = draw.choice(changes)(draw, message)
     return message if draw.random() < BEYOND else message[:MOST_PARTS]
 
 
@@ -248,3 +250,4 @@ def _value(draw: random.Random, message: Message) -> Message:
 
 _ALL = (_flip, _cut, _parts, _noise, _far, _far, _turned, _cov, _value, _value)
 _ALL += tuple(_header(change) for change in (_scalar, _scalar, _scalar, _shape, _form))
+_OF_KEYFRAMES = (*_ALL, *[mutate_keyframe] * len(_ALL))

@@ -14,7 +14,19 @@ from harness import EdgeProgram, HonestAgents, Keys, Program, Result, Setup, Wat
 
 SETTLED_S = 3.0  # of the honest agents alone, before anything begins
 RSS_MB = 300.0  # by which all processes of the edge together may grow from the attack's beginning on
-BAD_WORDS = ("Traceback", "Warning:", "Assertion failed", "mapper died", "step failed", "write failed")
+BAD_WORDS = (
+    "JPEG data",
+    "JPEG file",
+    "Traceback",
+    "Warning:",
+    "Assertion failed",
+    "mapper died",
+    "step failed",
+    "write failed",
+)
+STEP_MS = 300.0  # median of a kind of step of the mapper
+LONGEST_STEP_MS = 5000.0  # on a machine whose cores others have
+MAP_ERROR_M = 0.1  # of the honest agents' places in one map; some cm without an attack
 SAID_BYTES = 2_000_000  # log and events together; honest agents of some minutes write a tenth of it
 
 
@@ -169,6 +181,31 @@ def _counted_keyframes(rows: dict[str, Any], agent: dict[str, Any]) -> int:
         if (tag := row["run"].removeprefix(prefix)) != row["run"] and agent["tag"].startswith(tag)
     ]
     return sum(row["keyframes"] for row in own)
+
+
+def judge_steps(result: Result, stay: Stay) -> None:
+    """No kind of step of the mapper takes long."""
+    for kind in ("describe", "place", "align", "verify", "solve"):
+        ms = stay.counts.get(f"{kind}_ms", {})
+        result.figures[f"{kind}_ms"] = [ms.get(key) for key in ("n", "p50", "max")]
+        usual, longest = ms.get("p50") or 0.0, ms.get("max") or 0.0
+        result.expect(usual < STEP_MS, f"{kind}: {usual:.0f} ms in the median")
+        result.expect(longest < LONGEST_STEP_MS, f"{kind}: {longest:.0f} ms once")
+
+
+def judge_map(result: Result, stay: Stay) -> None:
+    """The honest agents are in one map, where they are in truth."""
+    error_m = stay.agents[0]["joint_error_m"]
+    result.figures["joint_error_m"] = error_m
+    result.expect(error_m < MAP_ERROR_M, f"the honest agents are {error_m:.3g} m off in the map")
+
+
+def judge_suspicion(result: Result, stay: Stay, word: str) -> None:
+    """The edge said what is wrong with an attacker's keyframes."""
+    rows = stay.counts.get("agents", {}).values()
+    said = [row["last_suspicion"] for row in rows if row["last_suspicion"]]
+    result.figures["suspicion"] = said[:1]
+    result.expect(any(word in line for line in said), f"nobody was suspected of {word!r}: {said[:2]}")
 
 
 def judge_latency(result: Result, attacked: Stay, control: Stay, ratio: float, slack_ms: float) -> None:

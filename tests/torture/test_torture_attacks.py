@@ -11,6 +11,7 @@ import pytest
 import siege
 from attacks import ATTACKS
 from harness import SETUPS, EdgeProgram, Program, Result, Setup
+from image_attacks import IMAGE_ATTACKS
 
 SEED = 20261126
 
@@ -22,6 +23,7 @@ class Case:
     setup: Setup = SETUPS[0]
     said_bytes: int = siege.SAID_BYTES
     keys_of: str = "eve"
+    suspicion: str = ""  # what the edge has to say of the attacker's keyframes
 
 
 MAP, KEYS = Setup(map=True), Setup(map=True, keys=True)
@@ -32,6 +34,13 @@ CASES = {name: Case() for name in ATTACKS if name != "streamed-hellos"} | {
     "replay": Case(MAP),
     "flood-keyframe": Case(MAP),
     "strangers": Case(KEYS, keys_of="mallory"),
+    "image-bombs": Case(MAP, suspicion="px"),
+    "damaged-images": Case(MAP, suspicion="its image is damaged"),
+    "false-spans": Case(MAP, suspicion="off its steps"),
+    "odometry-elsewhere": Case(MAP),
+    "false-loops": Case(MAP),
+    "flood-image": Case(KEYS),
+    "four-agents": Case(KEYS),
 }
 ALSO = [
     ("reset-while-full", Case(KEYS)),
@@ -41,9 +50,7 @@ ALSO = [
 ]
 
 
-def run(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path, results: Path) -> siege.Stay:
-    result = Result(name, str(case.setup), SEED)
-
+def attacked(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path) -> siege.Stay:
     def attack(edge: EdgeProgram) -> Program:
         more = ["--http", edge.http] if edge.http else []
         more += ["--keys", *edge.keys.of(case.keys_of)] if edge.keys else []
@@ -57,8 +64,18 @@ def run(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path, re
         )
         return siege.python("attacks.py", tmp_path / "attack.log", name, edge.address, *how, *more)
 
-    stay = siege.stay(tmp_path / "edge", case.setup, attack, most_s=3 * seconds + 90)
+    return siege.stay(tmp_path / name, case.setup, attack, most_s=3 * seconds + 90)
+
+
+def run(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path, results: Path) -> siege.Stay:
+    result = Result(name, str(case.setup), SEED)
+    stay = attacked(name, case, seconds, traffic, tmp_path)
     siege.judge(result, stay, said_bytes=case.said_bytes)
+    if name in IMAGE_ATTACKS:
+        siege.judge_steps(result, stay)
+        siege.judge_map(result, stay)
+    if case.suspicion:
+        siege.judge_suspicion(result, stay, case.suspicion)
     if name == "burst":
         result.expect(
             stay.attack.get("acknowledged") == 800,
@@ -84,6 +101,16 @@ def test_attack_short(name: str, case: Case, traffic: Path, tmp_path: Path, resu
 )
 def test_attack_long(name: str, case: Case, traffic: Path, tmp_path: Path, results: Path) -> None:
     run(name, case, 20.0, traffic, tmp_path, results)
+
+
+@pytest.mark.slow
+def test_a_flood_of_images_delays_others_little(traffic: Path, tmp_path: Path, results: Path) -> None:
+    """By at most twice what as many agents within their rate do."""
+    result = Result("flood of images", str(KEYS), SEED)
+    flood = attacked("flood-image", Case(KEYS), 12.0, traffic, tmp_path)
+    control = attacked("four-agents", Case(KEYS), 12.0, traffic, tmp_path)
+    siege.judge_latency(result, flood, control, ratio=2.0, slack_ms=300.0)
+    result.write(results).check()
 
 
 @pytest.mark.slow

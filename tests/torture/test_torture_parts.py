@@ -14,11 +14,13 @@ import pytest
 from corpus import KINDS, Corpus, Recorded, read, write
 from fuzzer import _small
 from helpers.hellos import hello_of
+from keyframe_mutations import ARRAYS, ROW_BYTES, Fields, mutate_keyframe
 from mutations import mutate
 from raw_wire import multipart, pack, unpack
 from replay import shrink
 from soak import slope
 
+from share.earlier_poses import EarlierPoses
 from share.errors import WireError
 from share.wire.codec import decode, encode
 from share.wire.messages import Ping, PoseUpdate
@@ -26,11 +28,15 @@ from share.wire.messages import Ping, PoseUpdate
 
 @pytest.fixture
 def traffic(tmp_path: Path) -> Path:
-    from share.types import Keyframe, TrackState, View
+    from share.types import Keyframe, KeyframeImage, TrackState, View
+    from share.vision.image_codec import encode_jpeg
 
     n, eye = 20, np.eye(4)
     view = View(np.zeros((n, 2)), np.ones((n, 3)), np.zeros((n, 32)))
-    keyframe = Keyframe(0, -1, 5, eye, 1e-6 * np.eye(6), eye, np.zeros(3), 0.0, view)
+    jpeg = np.frombuffer(encode_jpeg(np.tile(np.arange(160, dtype=np.uint8), (120, 1)), 50), np.uint8)
+    image = KeyframeImage(jpeg, np.zeros((n, 2)), np.ones((n, 3)), np.full(n, 0.01))
+    earlier = EarlierPoses(np.array([2, 5]), np.tile(eye, (2, 1, 1)), 1e-6 * np.tile(np.eye(6), (2, 1, 1)))
+    keyframe = Keyframe(9, 8, 5, eye, 1e-6 * np.eye(6), eye, np.zeros(3), 0.0, view, 8, image, earlier)
     said = [hello_of("ann", 7), PoseUpdate(1, TrackState.OK, -1, eye), keyframe, Ping(1, 2)]
     path = tmp_path / "traffic.jsonl"
     write(
@@ -100,6 +106,33 @@ def test_mutations_are_mostly_refused_but_not_all(traffic: Path) -> None:
                     refused.add(kind)
     assert {"hello", "pose", "keyframe", "evaluation", "ping"} <= passed
     assert {"hello", "pose", "keyframe", "evaluation", "ping"} <= refused
+
+
+def test_mutations_of_keyframes_reach_image_surfaces_and_spans(traffic: Path) -> None:
+    """A third passes the decoder, each array changed in some of them."""
+    (message,) = Corpus(traffic).by_kind["keyframe"]
+    draw, passed, changed = random.Random(1), 0, set()
+    for _ in range(1000):
+        mutated = mutate(draw, message)
+        try:
+            decode(mutated)
+        except WireError:
+            continue
+        passed += 1
+        changed |= {name for name, a, b in zip(ARRAYS, mutated[1:], message[1:], strict=True) if a != b}
+    assert passed > 330
+    assert changed >= {*ARRAYS} - {"uv", "points", "descriptors"}  # which SHARE's agents do not send
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mutated_keyframe_has_the_form_that_its_header_states(traffic: Path, seed: int) -> None:
+    (message,) = Corpus(traffic).by_kind["keyframe"]
+    draw = random.Random(seed)
+    for _ in range(200):
+        fields = Fields(mutate_keyframe(draw, message))
+        for spec, (name, data) in zip(fields.head[3], fields.arrays.items(), strict=True):
+            if name in ROW_BYTES:
+                assert spec[1][0] == len(data) // ROW_BYTES[name]
 
 
 def test_multipart_has_its_flags() -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -18,6 +22,7 @@ from share.types import (
     KeyframeImage,
     View,
 )
+from share.vision.decoder_complaints import with_complaints
 from share.vision.image_codec import encode_jpeg, encode_png
 from share.vision.keyframe_images import Surfaces, compress, decompress, image_objection
 
@@ -199,3 +204,49 @@ def test_an_image_larger_than_any_edge_bears_is_left_out() -> None:
     said = image_objection(of_jpeg(np.frombuffer(jpeg, np.uint8)), Camera(2000, 2000, 900, 900, 1000, 1000))
     assert said is not None and "more than 2400000" in said
     assert decompress(of_jpeg(np.frombuffer(jpeg, np.uint8)), large) is None
+
+
+def filled_up() -> np.ndarray:
+    """A JPEG whose end is missing in the middle of the pixels: libjpeg fills the rest with gray."""
+    return np.frombuffer(JPEG[: len(JPEG) // 2] + b"\xff\xd9", np.uint8)
+
+
+def test_what_libjpeg_fills_up_is_damaged_and_nothing_is_written_to_stderr(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    image = of_jpeg(filled_up())
+    assert image_objection(image, CAMERA) is None
+    assert cv2.imdecode(filled_up(), cv2.IMREAD_GRAYSCALE).shape == (480, 640)
+    assert "Corrupt JPEG data" in capfd.readouterr().err
+    assert decompress(image, CAMERA) is None
+    assert decompress(of_jpeg(JPEG), CAMERA) is not None
+    assert capfd.readouterr().err == ""
+
+
+def test_stderr_is_as_it_was_after_a_decoder_fails(capfd: pytest.CaptureFixture[str]) -> None:
+    def fails() -> None:
+        os.write(2, b"lost")
+        raise ValueError("no image")
+
+    with pytest.raises(ValueError, match="no image"):
+        with_complaints(fails)
+    os.write(2, b"seen")
+    assert with_complaints(lambda: os.write(2, b"noticed")) == (7, "noticed")
+    assert capfd.readouterr().err == "seen"
+
+
+def test_images_are_decoded_by_several_threads_at_once() -> None:
+    images = [of_jpeg(JPEG), of_jpeg(filled_up())] * 20
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(lambda image: decompress(image, CAMERA) is not None, images))
+    assert found == [True, False] * 20
+    assert len(os.listdir("/proc/self/fd")) < 200
+
+
+def test_an_image_is_decoded_without_a_stderr() -> None:
+    code = (
+        "import numpy as np; from share.vision.decoder_complaints import with_complaints;"
+        "print(with_complaints(lambda: 5))"
+    )
+    done = subprocess.run(["/bin/sh", "-c", f"exec {sys.executable} -c '{code}' 2>&-"], capture_output=True)
+    assert done.stdout.strip() == b"(5, '')"

@@ -14,7 +14,7 @@ from helpers.wire_strategies import messages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from share.earlier_poses import MAX_EARLIER, EarlierPoses
+from share.earlier_poses import MAX_SPANS, EarlierPoses
 from share.errors import WireError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
@@ -137,7 +137,7 @@ def with_earlier(sent: Keyframe, count: int) -> Keyframe:
 
 
 def test_poses_relative_to_earlier_keyframes_come_as_they_were_sent() -> None:
-    sent = with_earlier(keyframe(0, 40), MAX_EARLIER)
+    sent = with_earlier(keyframe(0, 40), MAX_SPANS)
     got = codec.decode(copied(codec.encode(sent)))
     assert isinstance(got, Keyframe)
     for name in ("ids", "T_earlier_body", "cov"):
@@ -147,7 +147,7 @@ def test_poses_relative_to_earlier_keyframes_come_as_they_were_sent() -> None:
 
 
 def test_the_largest_keyframe_image_is_decoded() -> None:
-    sent = with_earlier(keyframe_with_image(MAX_SURFACES, MAX_JPEG_BYTES, 40), MAX_EARLIER)
+    sent = with_earlier(keyframe_with_image(MAX_SURFACES, MAX_JPEG_BYTES, 40), MAX_SPANS)
     assert same(codec.decode(copied(codec.encode(sent))), sent)
     assert max(map(len, codec.encode(sent))) <= codec.MAX_FRAME_BYTES
     guard = BacklogLimits.for_frame_size(codec.MAX_FRAME_BYTES)

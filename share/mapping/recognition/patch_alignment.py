@@ -64,6 +64,10 @@ class ImageView:
         """The image (H, W); None if it is damaged."""
         return decompress(self.source, self.camera)
 
+    @property
+    def is_intact(self) -> bool:
+        return self.pixels is not None
+
     @cached_property
     def pyramid(self) -> tuple[U8, ...]:
         """The image at full, half and a quarter of its size; empty if it is damaged."""
