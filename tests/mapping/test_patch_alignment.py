@@ -110,7 +110,37 @@ def test_the_covariance_is_that_of_right_perturbations_of_the_bodies_pose(
         assert found.inliers > 0.9 * found.found
     assert 4.5 < np.mean(squared) < 7.0
     spread = np.linalg.eigvalsh(np.cov(np.array(whitened).T))
-    assert spread[0] > 0.4 and spread[-1] < 1.8
+    assert spread[1] > 0.4 and spread[-1] < 1.8  # but for the length, which a shared error would change
+
+
+def test_an_error_that_all_depths_of_a_view_share_is_in_the_covariance(room: Planes, pairs) -> None:
+    """As of a camera without a baseline: the pose is off with the depths' scale, and says so."""
+    rng, sigma, squared = np.random.default_rng(4), 0.03, []
+    for true, *images in pairs:
+        for _ in range(8):
+            views = [scaled_depths(image, float(np.exp(rng.normal(0, sigma))), sigma) for image in images]
+            found = align_images(true, *views)
+            assert found is not None and found.depth_scale is not None
+            squared.append(nees(error(true, found.T_c_q), found.cov))
+            assert found.depth_scale.shared_sigma == pytest.approx(2**0.5 * sigma, rel=1e-3)
+    assert 1.0 < np.mean(squared) < 7.0
+
+
+def test_depths_known_to_another_camera_put_the_pose_right(pairs) -> None:
+    """One view's depths are 4 % too large, within its sigma; the other's are sure."""
+    true, query, candidate = pairs[0]
+    found = align_images(true, scaled_depths(query, 1.04, 0.04), scaled_depths(candidate, 1.0, 0.002))
+    assert found is not None and found.depth_scale is not None
+    assert np.linalg.norm(error(true, found.T_c_q)[3:]) < 0.0015
+    assert found.depth_scale.log == pytest.approx(np.log(1.04), abs=0.004)
+
+
+def scaled_depths(view: ImageView, scale: float, sigma: float) -> ImageView:
+    """The view with depths `scale` times as large, and this relative sigma of each."""
+    plane = view.plane / scale
+    rho = (rays(view.uv) * plane).sum(axis=1)
+    source = dataclasses.replace(view.source, plane=plane, rho_sigma=sigma * rho)
+    return ImageView(source, CAMERA, T_BODY_CAM)
 
 
 def test_the_covariance_of_aligned_images_is_not_too_small(room: Planes, pairs) -> None:
@@ -138,9 +168,9 @@ def test_derivatives_of_the_residuals(pairs) -> None:
     assert len(forward.feature) > 40
 
     def predicted(T: np.ndarray, source: ImageView) -> np.ndarray:
-        return -patch_alignment._residuals(T, source, candidate, forward, 1.0).r
+        return -patch_alignment._residuals(T, source, candidate, forward, 1.0, 0.0).r
 
-    at = patch_alignment._residuals(T, query, candidate, forward, 1.0)
+    at = patch_alignment._residuals(T, query, candidate, forward, 1.0, 0.0)
     step = 1e-6
     for k in range(6):
         xi = np.zeros(6)

@@ -121,9 +121,14 @@ class ComparisonEquations:
 
 
 def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
-    """Robust mean of at least one log scale. sigma: from their scatter if that is larger."""
-    logs, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
-    variance = variance + _LOG_SCALE_FLOOR**2
+    """Robust mean of at least one log scale. sigma: from their scatter if that is larger.
+
+    The error that the depths of a view share may last: in the mean it counts with its least value, that of
+    the view which knows its scale best.
+    """
+    logs = np.array([s.log for s in scales])
+    shared_variance = np.array([s.shared_sigma for s in scales]) ** 2
+    variance = np.array([s.sigma for s in scales]) ** 2 + shared_variance + _LOG_SCALE_FLOOR**2
     mean, weight = float(np.median(logs)), np.ones(len(logs))
     mad_variance = float(np.median(np.abs(logs - mean)) / _MAD_PER_SIGMA) ** 2
     variance = variance * max(1.0, mad_variance / float(np.median(variance)))
@@ -133,9 +138,8 @@ def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
     information = weight / variance
     scatter = float((information**2 * (logs - mean) ** 2).sum()) ** 0.5
     spread = scatter / float(information.sum())  # Huber's sandwich
-    return ScalarEstimate(
-        mean, float(np.hypot(max(information.sum() ** -0.5, spread), _MIN_SCALE_SIGMA)), len(logs)
-    )
+    lasting = max(_MIN_SCALE_SIGMA, float(shared_variance.min()) ** 0.5)
+    return ScalarEstimate(mean, float(np.hypot(max(information.sum() ** -0.5, spread), lasting)), len(logs))
 
 
 def compare_odometry(
