@@ -11,7 +11,7 @@ from share.mapping.atlas import Atlas
 from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64
 
-CONFIG = MergeConfig(join_places=5)
+CONFIG = MergeConfig(join_places=5, enter_m=0.2)  # the loops of walkers are no surer
 WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 
 
