@@ -207,6 +207,7 @@ class Mapper:
     def _look_up(self, node_id: int) -> Job:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
         yield from self._describe(node_id)
+        yield self._review_joins(node_id)
         is_aligned = yield from self._align_nearby(node_id)
         if is_aligned and len(self.atlas.map_sizes()) == 1 and node_id % _RECHECK_INTERVAL:
             return  # the map is right here, and there is no other to find
@@ -261,7 +262,6 @@ class Mapper:
         if self._queries.is_hurried:
             known = [n for n in candidates if n in views]
             candidates = rank_candidates(self.atlas.graph, node_id, known)
-        yield self._review_joins(node_id)
         search = CandidateSearch(candidates)
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
             if not {node_id, candidate} <= views.keys():
