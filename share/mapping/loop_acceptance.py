@@ -186,7 +186,7 @@ class LoopAcceptance:
         existing_ids = self._separating_loops(a, b)
         existing = self._weigh_existing(existing_ids)
         reason = f"{reason}, {existing} oppose it"
-        if evidence.weight <= _CONTRADICTING_WEIGHT * existing.weight:
+        if not evidence.outweighs(existing, _CONTRADICTING_WEIGHT):
             return LoopDecision(False, f"{reason}, more weight needed")
         if objection := self._overlap_objection(loop):
             return LoopDecision(False, reason + objection)

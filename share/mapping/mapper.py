@@ -207,14 +207,13 @@ class Mapper:
     def _look_up(self, node_id: int) -> Job:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
         yield from self._describe(node_id)
-        yield self._review_joins(node_id)
         is_aligned = yield from self._align_nearby(node_id)
         if is_aligned and len(self.atlas.map_sizes()) == 1 and node_id % _RECHECK_INTERVAL:
             return  # the map is right here, and there is no other to find
         yield from self._query(node_id)
 
     def _describe(self, node_id: int) -> Job:
-        """Find the ORB features of a keyframe that came as an image only."""
+        """Find the ORB features of a keyframe that came as an image, and review recent merges by them."""
         if (image := self._views.undescribed_image(node_id)) is None:
             return
         try:
@@ -223,7 +222,7 @@ class Mapper:
             self._views.describe(node_id, View.empty())  # else it would be tried for ever
             raise
         self._views.describe(node_id, view)
-        yield []
+        yield self._review_joins(node_id)
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""
@@ -262,6 +261,8 @@ class Mapper:
         if self._queries.is_hurried:
             known = [n for n in candidates if n in views]
             candidates = rank_candidates(self.atlas.graph, node_id, known)
+        has_image = self._views.image(node_id) is not None
+        yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
         search = CandidateSearch(candidates)
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
             if not {node_id, candidate} <= views.keys():
