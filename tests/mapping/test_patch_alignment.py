@@ -12,6 +12,7 @@ from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
 from share.geometry import se3
 from share.geometry.camera import rays
 from share.mapping.recognition import patch_alignment
+from share.mapping.recognition.depth_scale import DepthScale
 from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_images, align_verified
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import KeyframeImage, View
@@ -287,8 +288,11 @@ def test_a_pose_whose_patches_disagree_is_kept_and_trusted_less(pairs) -> None:
         candidate.source, plane=candidate.source.plane * rng.choice([0.93, 1.07], (len(candidate.uv), 1))
     )
     views = [ImageView(image, CAMERA, T_BODY_CAM) for image in (wild, wild_c)]
-    kept = align_verified(verified(true), *views)
+    orb = dataclasses.replace(verified(true), depth_scale=DepthScale(0.01, 0.02))
+    kept = align_verified(orb, *views)
     np.testing.assert_array_equal(kept.T_c_q, true)
+    shared_sigma = np.hypot(*(view.shared_depth_sigma for view in views))
+    assert kept.depth_scale == DepthScale(0.01, 0.02, None, shared_sigma)
     np.testing.assert_allclose(kept.cov, 10 * verified(true).cov)
     refusal = align_from_map(true, *views)
     assert isinstance(refusal, Refusal) and "agree with one pose" in refusal.reason

@@ -145,7 +145,10 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
     refined = None if aligned is None else _verification(aligned, aligned.found)
     if isinstance(refined, Verification):
         return refined
-    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov)
+    scale = verified.depth_scale
+    if scale is not None:
+        scale = scale._replace(shared_sigma=_shared_sigma(query, candidate))
+    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov, depth_scale=scale)
 
 
 def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verification | Refusal:
@@ -257,6 +260,11 @@ class _AlignedPose(NamedTuple):
     depth_scale: DepthScale | None
 
 
+def _shared_sigma(query: ImageView, candidate: ImageView) -> float:
+    """Return the sigma of the relative scale of both views' depths that many features do not average out."""
+    return float(np.hypot(query.shared_depth_sigma, candidate.shared_depth_sigma))
+
+
 def _fit_pose(
     T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
 ) -> _AlignedPose:
@@ -283,13 +291,16 @@ def _fit_pose(
         if np.abs(step).max() < _CONVERGED_STEP * size:
             break
     inlier, cov = chi2 < _INLIER_CHI2, np.linalg.inv(information)
-    depth_scale = _depth_scale(J[inlier], r[inlier], log_scales, scale_sigma, cov)
+    depth_scale = _depth_scale(J[inlier], r[inlier], log_scales)
+    if depth_scale is not None:
+        pose_sensitivity = cov[:6, 6] / scale_sigma[0] ** 2
+        depth_scale = DepthScale(*depth_scale[:2], pose_sensitivity, _shared_sigma(query, candidate))
     return _AlignedPose(T, cov[:6, :6], int(inlier.sum()), depth_scale)
 
 
-def _depth_scale(J: F64, r: F64, log_scales: F64, scale_sigma: F64, cov: F64) -> DepthScale | None:
+def _depth_scale(J: F64, r: F64, log_scales: F64) -> DepthScale | None:
     """Return the scale of the query's depths over the candidate's by residuals r (M, 2) at the fit, with
-    nothing known of it before. J (M, 2, 8), cov (8, 8) and log_scales (2,): of the fit."""
+    nothing known of it before. J (M, 2, 8) and log_scales (2,): of the fit."""
     if len(r) < _MIN_INLIERS:
         return None
     A = J[:, :, :7].reshape(-1, 7)
@@ -297,7 +308,7 @@ def _depth_scale(J: F64, r: F64, log_scales: F64, scale_sigma: F64, cov: F64) ->
     log_scale = float(log_scales[0] - log_scales[1] + np.linalg.solve(normal, A.T @ r.ravel())[6])
     variance = max(1.0, float((r * r).sum()) / max(1, 2 * len(r) - 7))
     sigma = float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
-    return DepthScale(log_scale, sigma, cov[:6, 6] / scale_sigma[0] ** 2, float(np.hypot(*scale_sigma)))
+    return DepthScale(log_scale, sigma)
 
 
 class _Residuals(NamedTuple):
