@@ -32,6 +32,7 @@ _IRLS_ITERATIONS = 6
 _CHI2_6DOF_MEDIAN = 5.35
 _PRIOR_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad; so that two loops have a solution
 _MAD_PER_SIGMA = 0.6745  # median of |x| of a standard normal distribution
+_HERE_M, _HERE_RAD = 1.0, 0.5  # a loop that deviates by more is of another place that looks alike, not noisy
 _MIN_INLIER_WEIGHT = 0.3  # of a loop that fits
 _LOG_SCALE_FLOOR = 0.004  # added sigma of one loop's depth scale: occlusions, pixels
 _AS_STATED = (1.0, 1.0)
@@ -228,7 +229,10 @@ def _solve(e: ComparisonEquations, covariance_scales: tuple[float, float]) -> Od
         noise = (loop_cov @ weighted[:, :, None])[:, :, 0] / weight[:, None]  # the loops' part of it
         chi2 = np.einsum("ni,nij,nj->n", noise, loop_information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY_WIDTH_SQUARED)
-    nis = float(np.median(chi2)) / _CHI2_6DOF_MEDIAN
+    is_here = (np.linalg.norm(noise[:, :3], axis=1) < _HERE_RAD) & (
+        np.linalg.norm(noise[:, 3:], axis=1) < _HERE_M
+    )
+    nis = float(np.median(chi2[is_here])) / _CHI2_6DOF_MEDIAN if is_here.any() else 0.0
     misfit = float(residual @ information @ residual) / max(1, 6 * n - 10)  # shows a wrong model
     cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
     rotation = theta[7:]
