@@ -229,9 +229,7 @@ def _solve(e: ComparisonEquations, covariance_scales: tuple[float, float]) -> Od
         noise = (loop_cov @ weighted[:, :, None])[:, :, 0] / weight[:, None]  # the loops' part of it
         chi2 = np.einsum("ni,nij,nj->n", noise, loop_information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY_WIDTH_SQUARED)
-    is_here = (np.linalg.norm(noise[:, :3], axis=1) < _HERE_RAD) & (
-        np.linalg.norm(noise[:, 3:], axis=1) < _HERE_M
-    )
+    is_here = (np.abs(residual.reshape(n, 6)) < [_HERE_RAD] * 3 + [_HERE_M] * 3).all(axis=1)
     nis = float(np.median(chi2[is_here])) / _CHI2_6DOF_MEDIAN if is_here.any() else 0.0
     misfit = float(residual @ information @ residual) / max(1, 6 * n - 10)  # shows a wrong model
     cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
