@@ -116,7 +116,7 @@ class MergeConfig:
 
     join_places: int = 2  # places that must agree before maps merge; of a smaller map, all but one
     overlap_pairs: int = 0  # least number of overlapping view pairs before maps merge, where rooms are copies
-    enter_m: float = 0.05  # an agent with a larger map position sigma waits for its correction
+    enter_m: float = 0.025  # an agent waits for its correction while what is 3 m ahead has a larger sigma
 
     def __post_init__(self) -> None:
         _require_positive(self, "join_places")

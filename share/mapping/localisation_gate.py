@@ -1,8 +1,10 @@
 """The localisation gate: an agent enters another map once its place there is known well enough.
 
 A merge by a few loops at one spot can be wrong by degrees, which further loops correct within seconds; until
-then the agent keeps its own map. Agents that shared a map enter the new one together. The wait is bounded by
-a number of keyframes with loops: in a large hall, far from the reference, no pose is known to centimetres.
+then the agent keeps its own map. Agents that shared a map enter the new one together. What counts is what a
+wearer looks at, so a rotation counts by its lever. As keyframes with loops become more, each of them makes
+the pose less surer, so the gate opens wider; at last it opens to all: in a large hall, far from the
+reference, no pose is known to centimetres.
 """
 
 from __future__ import annotations
@@ -10,17 +12,27 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
+from share.geometry import se3
 from share.types import F64
 
 PATIENCE = 20  # keyframes with loops after which agents enter another map however uncertain
+_WIDENS_AFTER = 4  # keyframes with loops; with n times as many, n times the sigma is enough
+_AHEAD_M = 3.0  # what a wearer looks at
+
+
+def sigma_ahead(cov: F64) -> float:
+    """Return the standard deviation (m) of what is 3 m from a body whose pose has the covariance (6, 6)."""
+    return float(np.hypot(se3.position_sigma(cov), _AHEAD_M * np.sqrt(np.trace(cov[:3, :3]))))
 
 
 @dataclass(frozen=True, eq=False)
 class PlacementUncertainty:
     """Uncertainty of an agent's pose in a map.
 
-    cov (6, 6): of T_map_odom. sigma_m: root of the trace of the position covariance, m. answered_id: the
-    agent's keyframe with a loop that is new in this solution, or None.
+    cov (6, 6): of T_map_odom. sigma_m: `sigma_ahead` of the body's pose. answered_id: the agent's keyframe
+    with a loop that is new in this solution, or None.
     """
 
     cov: F64
@@ -32,7 +44,7 @@ class LocalisationGate:
     """State of the gate for each segment. Segments and reference segments are given by their indices."""
 
     def __init__(self, enter_m: float) -> None:
-        """enter_m: sigma at which agents enter another map, at the latest after `PATIENCE` loops."""
+        """enter_m: sigma at which agents enter another map, at the latest after `PATIENCE` keyframes."""
         self._enter_m = enter_m
         # By segment: reference segment of the published map, and the covariance there.
         self._published: dict[int, tuple[int, F64 | None]] = {}
@@ -96,8 +108,7 @@ class LocalisationGate:
         entering: list[int],
     ) -> bool:
         """Decide for the segments that enter from one map, and count their keyframes with loops."""
-        if max(uncertainties[s].sigma_m for s in entering) <= self._enter_m:
-            return False
         waited = self._waited.setdefault((previous_map, reference_segment), set())
         waited.update((s, key) for s in entering if (key := uncertainties[s].answered_id) is not None)
-        return len(waited) <= PATIENCE
+        enough_m = self._enter_m * max(1.0, len(waited) / _WIDENS_AFTER)
+        return max(uncertainties[s].sigma_m for s in entering) > enough_m and len(waited) <= PATIENCE

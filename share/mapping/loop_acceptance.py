@@ -43,6 +43,7 @@ _MAX_PENDING = 200  # pending loops; the oldest is dropped
 JOIN_FOUND = 0.3  # share of the common points that must be found, on average, before maps merge
 _OVERLAP_MISSING = 0.06  # largest share of the common points that may be missing
 _UNDO_CUSUM = 0.6  # CUSUM of the missing share above that; more forbids or undoes a merge
+_UNDO_LOST = 1.5  # CUSUM of what is found too seldom; more undoes a merge (true pairs: below 1.0)
 _COMPETING_WEIGHT = 0.5  # a competing hypothesis with more than this share of the weight blocks a merge
 _CONTRADICTING_PLACES = 4  # contradicting loops split a map from this many places on
 _CONTRADICTING_WEIGHT = 1.4  # and from this multiple of the existing loops' weight on
@@ -97,12 +98,13 @@ class LoopAcceptance:
 
     def review_joins(self, node_id: int) -> LoopDecision | None:
         """Undo a recent merge that the view of a new node contradicts; None if there is none."""
-        for (a, b), cusum_value in self._overlap_check.review_joins(node_id, _OVERLAP_MISSING):
-            if cusum_value > _UNDO_CUSUM:
+        for (a, b), probation in self._overlap_check.review_joins(node_id, _OVERLAP_MISSING):
+            if probation.missing > _UNDO_CUSUM or probation.lost > _UNDO_LOST:
                 self._overlap_check.end_probation((a, b))
                 dropped = self._graph.drop_loops(self._separating_loops(a, b))
                 first, second = (self._graph.odometry.segments[s].name for s in (a, b))
-                reason = f"what {first} and {second} should share is missing (CUSUM {cusum_value:.1f})"
+                sums = f"CUSUM {probation.missing:.1f}, {probation.lost:.1f}"
+                reason = f"what {first} and {second} should share is missing ({sums})"
                 return LoopDecision(True, f"{reason}; {dropped_text(dropped)}", dropped=dropped)
         return None
 
@@ -186,7 +188,7 @@ class LoopAcceptance:
         existing_ids = self._separating_loops(a, b)
         existing = self._weigh_existing(existing_ids)
         reason = f"{reason}, {existing} oppose it"
-        if evidence.weight <= _CONTRADICTING_WEIGHT * existing.weight:
+        if not evidence.outweighs(existing, _CONTRADICTING_WEIGHT):
             return LoopDecision(False, f"{reason}, more weight needed")
         if objection := self._overlap_objection(loop):
             return LoopDecision(False, reason + objection)

@@ -8,7 +8,7 @@ found share.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ PLACE_M = 0.5  # views further apart than this are different places
 PLACE_RAD = 0.35  # views rotated further than this are different places
 NEAR_M = 2.5  # views further apart than this do not support a merge
 NEAR_RAD = 0.8  # views rotated further than this do not support a merge
+_FEW_PLACES = 5
 _DEFAULT_FOUND_SHARE = 0.5  # where not computed: that of most true loops
 
 
@@ -39,6 +40,12 @@ class LoopEvidence:
     @property
     def weight(self) -> float:
         return self.places * self.found_share**2
+
+    def outweighs(self, other: LoopEvidence, ratio: float) -> bool:
+        """Return whether its weight is more than `ratio` times the other's, by all places or by the same few
+        of both: in an aisle and its copy as many places agree as one passes, and what they share tells."""
+        few = [replace(x, places=min(x.places, _FEW_PLACES)) for x in (self, other)]
+        return self.weight > ratio * other.weight or few[0].weight > ratio * few[1].weight
 
     def __str__(self) -> str:
         return f"{self.places} places (weight {self.weight:.2f})"

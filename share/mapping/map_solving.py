@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from share.geometry import se3
 from share.mapping.graph.solver import GraphSolution, GraphUpdate
-from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty
+from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
 from share.mapping.loop_acceptance import LoopAcceptance, pending_text
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_graph import MapGraph
@@ -191,7 +191,7 @@ class MapSolving:
         uncertainties = {
             segment: PlacementUncertainty(
                 se3.inverse_cov(nodes[last].T_odom_body, covariances[last]),
-                se3.position_sigma(covariances[last]),
+                sigma_ahead(covariances[last]),
                 answered_ids.get(odometry.segments[segment].agent),
             )
             for segment, last in zip(job.segments, job.newest_nodes, strict=True)

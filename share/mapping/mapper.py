@@ -232,7 +232,7 @@ class Mapper:
         yield []
 
     def _describe(self, node_id: int) -> Job:
-        """Find the ORB features of a keyframe that came as an image only."""
+        """Find the ORB features of a keyframe that came as an image, and review recent merges by them."""
         if (image := self._views.undescribed_image(node_id)) is None:
             return
         key = self.atlas.key(node_id)
@@ -243,8 +243,8 @@ class Mapper:
             raise
         if (packed := self._views.describe(node_id, view)) is not None and len(packed):
             self._changes.append(SaveView(key, packed))
-        damaged = f"keyframe {key.id}: its image is damaged: without it"
-        yield [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", damaged)]
+        damaged = MapEvent(key.agent, "odometry suspect", f"keyframe {key.id}: its image is damaged: without it")
+        yield [*([] if image.is_intact else [damaged]), *self._review_joins(node_id)]
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""
@@ -283,7 +283,8 @@ class Mapper:
         if self._queries.is_hurried:
             known = [n for n in candidates if n in views]
             candidates = rank_candidates(self.atlas.graph, node_id, known)
-        yield self._review_joins(node_id)
+        has_image = self._views.image(node_id) is not None
+        yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
         search = CandidateSearch(candidates)
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
             if not {node_id, candidate} <= views.keys():

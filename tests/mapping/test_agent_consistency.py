@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -111,6 +112,19 @@ def test_scaled_covariances_hide_neither_a_camera_rotation_nor_a_path_scale():
 def test_drift_beyond_the_stated_covariances_raises_the_nis():
     """6 cm a step, above the noise of the loops; below it, loops cannot show drift."""
     assert compare_odometry(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3
+
+
+def test_loops_of_a_place_and_its_copy_are_no_noise():
+    """Every second loop is of a copy 5 m off and turned by half a turn."""
+    copy = se3.exp(np.array([0, 0, np.pi, 5.0, 1.0, 0]))
+    for seed in range(5):
+        mixed = [
+            dataclasses.replace(x, T_a_b=se3.orthonormal(se3.inverse(x.a.T) @ copy @ x.a.T @ x.T_a_b))
+            if n % 2
+            else x
+            for n, x in enumerate(loops(np.random.default_rng(seed)))
+        ]
+        assert compare_odometry(mixed).nis < 3
 
 
 def test_depth_scales_are_pooled_robustly():

@@ -8,10 +8,11 @@ from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping import loop_acceptance, loop_consistency
 from share.mapping.atlas import Atlas
+from share.mapping.loop_consistency import LoopEvidence
 from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64
 
-CONFIG = MergeConfig(join_places=5)
+CONFIG = MergeConfig(join_places=5, enter_m=0.2)  # the loops of walkers are no surer
 WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 
 
@@ -367,6 +368,15 @@ def test_slightly_more_contradicting_weight_does_not_undo_a_merge(ann: Walker, b
     fourth = [atlas.propose(x) for x in true[:4]][-1]
     assert "4 places (weight 1.35) support it, 5 places (weight 1.06) oppose it" in fourth.reason
     assert not fourth.accepted
+
+
+def test_along_an_aisle_and_its_copy_what_they_share_tells() -> None:
+    """Of a copy more places agree the longer one walks."""
+    true, copy = LoopEvidence(6, 0.62, 6), LoopEvidence(26, 0.48, 26)
+    assert true.weight < copy.weight
+    assert true.outweighs(copy, 1.4)
+    assert not copy.outweighs(replace(true, places=15), 1.4)
+    assert not LoopEvidence(3, 0.62, 3).outweighs(copy, 1.4)  # of too few places
 
 
 def test_loops_of_copies_do_not_outweigh_true_loops(ann: Walker, bob: Walker) -> None:

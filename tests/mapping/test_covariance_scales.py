@@ -131,6 +131,15 @@ def test_scattered_depth_scales_have_a_larger_sigma():
     assert 0.6 < np.sqrt((off**2).mean()) < 1.7
 
 
+def test_an_error_that_all_depths_share_does_not_average_out():
+    """Of a camera without a baseline, whose scale becomes surer: the surest view bounds what lasts."""
+    shared = np.linspace(0.03, 0.01, 40)
+    mean = robust_depth_scale([DepthScale(-0.012, 0.005, None, sigma) for sigma in shared])
+    assert mean.sigma >= 0.01
+    assert mean.sigma < 0.012
+    assert robust_depth_scale([DepthScale(-0.012, 0.005)] * 40).sigma < 0.004
+
+
 def test_dropped_evidence_no_longer_scales():
     """At once, not with the next step; the stated covariances of eve still count."""
     claimed_only = 100 / 2.25

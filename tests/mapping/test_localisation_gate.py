@@ -9,7 +9,7 @@ from helpers.atlas_sim import Walker, loop, settle
 from share.config import MergeConfig
 from share.mapping import localisation_gate
 from share.mapping.atlas import Atlas
-from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty
+from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
 from share.mapping.loops import Loop
 
 ANN, BOB, EVE, ROBOT = ALL = range(4)  # segments, the oldest first
@@ -62,6 +62,17 @@ def test_the_wait_is_bounded_by_keyframes_with_loops(gate: LocalisationGate) -> 
     assert gate.published_cov(BOB, ANN) is not None
 
 
+def test_the_gate_opens_wider_with_the_keyframes_that_did_not_help() -> None:
+    gate = LocalisationGate(enter_m=0.05)
+    waits = [bool(gate.update(ANN, ALL, {BOB: known(9.9, answers=keyframe)})) for keyframe in range(8)]
+    assert waits == [True] * 7 + [False]
+
+
+def test_a_rotation_counts_by_what_is_three_metres_ahead() -> None:
+    cov = np.diag([0.01**2, 0.0, 0.0, 0.04**2, 0.0, 0.0])
+    assert sigma_ahead(cov) == pytest.approx(0.05)
+
+
 def test_the_wait_restarts_for_another_map(gate: LocalisationGate) -> None:
     for reference in (EVE, ANN):
         for keyframe in range(3):
@@ -105,7 +116,7 @@ def uncertain_loop(ann: Walker, bob: Walker, at: int) -> Loop:
 def separate_maps() -> tuple[Atlas, Walker, Walker]:
     """Ann and bob in maps of their own, which see the same."""
     ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
-    atlas = Atlas(MergeConfig(join_places=1))
+    atlas = Atlas(MergeConfig(join_places=1, enter_m=0.1))
     for walker in (ann, bob):
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
@@ -120,7 +131,7 @@ def test_a_correction_waits_until_the_pose_in_the_map_is_known() -> None:
     (applied,) = settle(atlas)
     assert list(applied.corrections) == ["ann"]
     assert applied.waiting_sigma_m.keys() == {"bob"}
-    assert 0.05 < applied.waiting_sigma_m["bob"] < 0.5
+    assert 0.1 < applied.waiting_sigma_m["bob"] < 0.5
     atlas.propose(loop(ann, 11, bob, 11, np.random.default_rng(0)))
     (applied,) = settle(atlas)
     assert applied.corrections["bob"].map_id == "ann/0"

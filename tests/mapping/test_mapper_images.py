@@ -119,9 +119,16 @@ def _all_poses(mapper: Mapper) -> tuple[list[tuple[str, int]], np.ndarray]:
 
 
 @pytest.mark.long
-def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(place: Planes) -> None:
-    """And all, as soon as there is another map to find."""
+def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(
+    place: Planes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And all, as soon as there is another map to find; each reviews what was joined."""
     mapper = mapper_of("ann", "bob", "eve")
+    acceptance, reviewed = mapper.atlas.loop_acceptance, list[int]()
+    review = acceptance.review_joins
+    monkeypatch.setattr(
+        acceptance, "review_joins", lambda node_id: reviewed.append(node_id) or review(node_id)
+    )
     for _, sent in keyframes(place, -0.1, 1):
         mapper.add_keyframe("ann", sent)
     work(mapper)
@@ -135,6 +142,7 @@ def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(place
     assert len(joined) >= 4
     for is_aligned, is_queried, node_id in joined:
         assert is_aligned and is_queried == (node_id % 4 == 0)
+    assert sorted(reviewed) == list(range(12))
     elsewhere = keyframes(Planes(ROOM, seed=9), 0.0, 3, steps=1)
     mapper.add_keyframe("eve", elsewhere[0][1])
     work(mapper)

@@ -72,5 +72,5 @@ def test_an_empty_view_has_no_missing_points() -> None:
     query, candidate = sights(4, T_C_Q)
     empty = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
     assert missing_points(query, replace(candidate, view=empty), np.eye(4)) == MissingPoints(0, 0)
-    assert missing_regions(query, replace(candidate, view=empty), np.eye(4)) == MissingRegions(0, 0)
-    assert MissingPoints(0, 0).missing_share == MissingRegions(0, 0).missing_share == 0.0
+    assert missing_regions(query, replace(candidate, view=empty), np.eye(4)) == MissingRegions(0, 0, 0)
+    assert MissingPoints(0, 0).missing_share == MissingRegions(0, 0, 0).missing_share == 0.0

@@ -1,6 +1,7 @@
 """Two agents walk a ring of posters; in a copy of the ring some posters differ."""
 
 import numpy as np
+import pytest
 from helpers.atlas_sim import Walker, loop
 from numpy.typing import NDArray
 
@@ -10,6 +11,7 @@ from share.mapping.atlas import Atlas
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import Loop
+from share.mapping.overlap_check import JoinProbation, MissingRegions
 from share.mapping.recognition.verification import CameraView
 from share.types import F64, U8, View
 
@@ -99,6 +101,19 @@ def test_recognised_places_do_not_hide_missing_regions() -> None:
     decision = room.propose(room.loops(range(0, 6)))[-1]
     assert not decision.accepted
     assert "of the 20 overlapping views is missing: pending" in decision.reason
+
+
+def test_views_in_which_much_is_found_too_seldom_add_up() -> None:
+    """As of a copy that has everything, in other light or a little elsewhere."""
+    true, copy = MissingRegions(100, 0, 70), MissingRegions(100, 0, 45)
+    probation = JoinProbation()
+    for _ in range(20):
+        probation.add(copy, 0.06)
+    assert probation.missing == 0.0
+    assert probation.lost == pytest.approx(2.0)
+    for _ in range(20):
+        probation.add(true, 0.06)
+    assert probation.lost == 0.0
 
 
 def test_a_merge_is_undone_where_the_copy_ends() -> None:

@@ -12,6 +12,7 @@ from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
 from share.geometry import se3
 from share.geometry.camera import rays
 from share.mapping.recognition import patch_alignment
+from share.mapping.recognition.depth_scale import DepthScale
 from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_images, align_verified
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import KeyframeImage, View
@@ -110,7 +111,37 @@ def test_the_covariance_is_that_of_right_perturbations_of_the_bodies_pose(
         assert found.inliers > 0.9 * found.found
     assert 4.5 < np.mean(squared) < 7.0
     spread = np.linalg.eigvalsh(np.cov(np.array(whitened).T))
-    assert spread[0] > 0.4 and spread[-1] < 1.8
+    assert spread[1] > 0.4 and spread[-1] < 1.8  # but for the length, which a shared error would change
+
+
+def test_an_error_that_all_depths_of_a_view_share_is_in_the_covariance(room: Planes, pairs) -> None:
+    """As of a camera without a baseline: the pose is off with the depths' scale, and says so."""
+    rng, sigma, squared = np.random.default_rng(4), 0.03, []
+    for true, *images in pairs:
+        for _ in range(8):
+            views = [scaled_depths(image, float(np.exp(rng.normal(0, sigma))), sigma) for image in images]
+            found = align_images(true, *views)
+            assert found is not None and found.depth_scale is not None
+            squared.append(nees(error(true, found.T_c_q), found.cov))
+            assert found.depth_scale.shared_sigma == pytest.approx(2**0.5 * sigma, rel=1e-3)
+    assert 1.0 < np.mean(squared) < 7.0
+
+
+def test_depths_known_to_another_camera_put_the_pose_right(pairs) -> None:
+    """One view's depths are 4 % too large, within its sigma; the other's are sure."""
+    true, query, candidate = pairs[0]
+    found = align_images(true, scaled_depths(query, 1.04, 0.04), scaled_depths(candidate, 1.0, 0.002))
+    assert found is not None and found.depth_scale is not None
+    assert np.linalg.norm(error(true, found.T_c_q)[3:]) < 0.0015
+    assert found.depth_scale.log == pytest.approx(np.log(1.04), abs=0.004)
+
+
+def scaled_depths(view: ImageView, scale: float, sigma: float) -> ImageView:
+    """The view with depths `scale` times as large, and this relative sigma of each."""
+    plane = view.plane / scale
+    rho = (rays(view.uv) * plane).sum(axis=1)
+    source = dataclasses.replace(view.source, plane=plane, rho_sigma=sigma * rho)
+    return ImageView(source, CAMERA, T_BODY_CAM)
 
 
 def test_the_covariance_of_aligned_images_is_not_too_small(room: Planes, pairs) -> None:
@@ -138,9 +169,9 @@ def test_derivatives_of_the_residuals(pairs) -> None:
     assert len(forward.feature) > 40
 
     def predicted(T: np.ndarray, source: ImageView) -> np.ndarray:
-        return -patch_alignment._residuals(T, source, candidate, forward, 1.0).r
+        return -patch_alignment._residuals(T, source, candidate, forward, 1.0, 0.0).r
 
-    at = patch_alignment._residuals(T, query, candidate, forward, 1.0)
+    at = patch_alignment._residuals(T, query, candidate, forward, 1.0, 0.0)
     step = 1e-6
     for k in range(6):
         xi = np.zeros(6)
@@ -257,8 +288,11 @@ def test_a_pose_whose_patches_disagree_is_kept_and_trusted_less(pairs) -> None:
         candidate.source, plane=candidate.source.plane * rng.choice([0.93, 1.07], (len(candidate.uv), 1))
     )
     views = [ImageView(image, CAMERA, T_BODY_CAM) for image in (wild, wild_c)]
-    kept = align_verified(verified(true), *views)
+    orb = dataclasses.replace(verified(true), depth_scale=DepthScale(0.01, 0.02))
+    kept = align_verified(orb, *views)
     np.testing.assert_array_equal(kept.T_c_q, true)
+    shared_sigma = np.hypot(*(view.shared_depth_sigma for view in views))
+    assert kept.depth_scale == DepthScale(0.01, 0.02, None, shared_sigma)
     np.testing.assert_allclose(kept.cov, 10 * verified(true).cov)
     refusal = align_from_map(true, *views)
     assert isinstance(refusal, Refusal) and "agree with one pose" in refusal.reason

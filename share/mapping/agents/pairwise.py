@@ -32,6 +32,7 @@ _IRLS_ITERATIONS = 6
 _CHI2_6DOF_MEDIAN = 5.35
 _PRIOR_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad; so that two loops have a solution
 _MAD_PER_SIGMA = 0.6745  # median of |x| of a standard normal distribution
+_HERE_M, _HERE_RAD = 1.0, 0.5  # a loop that deviates by more is of another place that looks alike, not noisy
 _MIN_INLIER_WEIGHT = 0.3  # of a loop that fits
 _LOG_SCALE_FLOOR = 0.004  # added sigma of one loop's depth scale: occlusions, pixels
 _AS_STATED = (1.0, 1.0)
@@ -121,9 +122,14 @@ class ComparisonEquations:
 
 
 def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
-    """Robust mean of at least one log scale. sigma: from their scatter if that is larger."""
-    logs, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
-    variance = variance + _LOG_SCALE_FLOOR**2
+    """Robust mean of at least one log scale. sigma: from their scatter if that is larger.
+
+    The error that the depths of a view share may last: in the mean it counts with its least value, that of
+    the view which knows its scale best.
+    """
+    logs = np.array([s.log for s in scales])
+    shared_variance = np.array([s.shared_sigma for s in scales]) ** 2
+    variance = np.array([s.sigma for s in scales]) ** 2 + shared_variance + _LOG_SCALE_FLOOR**2
     mean, weight = float(np.median(logs)), np.ones(len(logs))
     mad_variance = float(np.median(np.abs(logs - mean)) / _MAD_PER_SIGMA) ** 2
     variance = variance * max(1.0, mad_variance / float(np.median(variance)))
@@ -133,9 +139,8 @@ def robust_depth_scale(scales: Sequence[DepthScale]) -> ScalarEstimate:
     information = weight / variance
     scatter = float((information**2 * (logs - mean) ** 2).sum()) ** 0.5
     spread = scatter / float(information.sum())  # Huber's sandwich
-    return ScalarEstimate(
-        mean, float(np.hypot(max(information.sum() ** -0.5, spread), _MIN_SCALE_SIGMA)), len(logs)
-    )
+    lasting = max(_MIN_SCALE_SIGMA, float(shared_variance.min()) ** 0.5)
+    return ScalarEstimate(mean, float(np.hypot(max(information.sum() ** -0.5, spread), lasting)), len(logs))
 
 
 def compare_odometry(
@@ -224,7 +229,8 @@ def _solve(e: ComparisonEquations, covariance_scales: tuple[float, float]) -> Od
         noise = (loop_cov @ weighted[:, :, None])[:, :, 0] / weight[:, None]  # the loops' part of it
         chi2 = np.einsum("ni,nij,nj->n", noise, loop_information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY_WIDTH_SQUARED)
-    nis = float(np.median(chi2)) / _CHI2_6DOF_MEDIAN
+    is_here = (np.abs(residual.reshape(n, 6)) < [_HERE_RAD] * 3 + [_HERE_M] * 3).all(axis=1)
+    nis = float(np.median(chi2[is_here])) / _CHI2_6DOF_MEDIAN if is_here.any() else 0.0
     misfit = float(residual @ information @ residual) / max(1, 6 * n - 10)  # shows a wrong model
     cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
     rotation = theta[7:]

@@ -32,15 +32,18 @@ class DepthScale(NamedTuple):
     """Log of the query's depths over the candidate's, with its sigma.
 
     pose_sensitivity (6,): left perturbation of T_c_q per unit of log that is corrected; None if unknown.
+    shared_sigma: of the error that all depths of a view have in common; it does not average out over points,
+    nor over views of the same time.
     """
 
     log: float
     sigma: float
     pose_sensitivity: F64 | None = None
+    shared_sigma: float = 0.0
 
     def reverse(self) -> DepthScale:
         """Return the scale with query and candidate exchanged; the pose sensitivity is dropped."""
-        return DepthScale(-self.log, self.sigma)
+        return DepthScale(-self.log, self.sigma, None, self.shared_sigma)
 
 
 def relative_depth_scale(

@@ -39,6 +39,11 @@ _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
 _MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
 _ITERATIONS = 6
 _CONVERGED_STEP = 1e-4  # rad and m, at full size
+_MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = (
+    1e-3,
+    1.0,
+)  # relative; a baseline is calibrated no better than the first
+_MIN_RHO = 1e-6  # 1/m
 _NOT_VISIBLE = 1e3  # whitened residual of what the pose puts behind the camera
 _MIN_DEPTH_RATIO = 0.02  # of the depth in the other camera: nearer counts as behind it
 _RIDGE = 1e-6
@@ -101,6 +106,14 @@ class ImageView:
         return self.source.rho_sigma.astype(np.float64)
 
     @cached_property
+    def shared_depth_sigma(self) -> float:
+        """Bound on the relative error that all depths have in common, such as the scale of a camera without a
+        baseline: no more than the surest of them has."""
+        rho = (rays(self.uv) * self.plane).sum(axis=1)
+        surest = (self.rho_sigma / np.maximum(rho, _MIN_RHO)).min(initial=_MAX_SHARED_DEPTH)
+        return max(_MIN_SHARED_DEPTH, float(surest))
+
+    @cached_property
     def uv_per_px(self) -> F64:
         """Derivative (N, 2, 2) of `uv` by px."""
         return np.asarray(np.linalg.inv(self.camera.jacobian(self.uv)))
@@ -136,7 +149,10 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
     refined = None if aligned is None else _verification(aligned, aligned.found)
     if isinstance(refined, Verification):
         return refined
-    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov)
+    scale = verified.depth_scale
+    if scale is not None:
+        scale = scale._replace(shared_sigma=_shared_sigma(query, candidate))
+    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov, depth_scale=scale)
 
 
 def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verification | Refusal:
@@ -196,13 +212,15 @@ def align_images(T_c_q: F64, query: ImageView, candidate: ImageView) -> AlignedL
     return AlignedLoop(T_bodies, to_body @ cov @ to_body.T, predicted, found, fit.inliers, scale)
 
 
-def _transfer(T: F64, source: ImageView, index: I64 | slice) -> tuple[F64, F64, F64, F64]:
-    """Project the source's features by T (4, 4), target from source.
+def _transfer(
+    T: F64, source: ImageView, index: I64 | slice, log_scale: float = 0.0
+) -> tuple[F64, F64, F64, F64]:
+    """Project the source's features by T (4, 4), target from source, with depths shorter by exp(log_scale).
 
     Return uv (N, 2) in the target, NaN behind it; the derivative D (N, 2, 3) of uv by the homogeneous point
     q (N, 3) = R ray + rho t; q; and rho (N,)."""
     ray, plane = rays(source.uv[index]), source.plane[index]
-    rho = (ray * plane).sum(axis=1)
+    rho = np.exp(log_scale) * (ray * plane).sum(axis=1)
     q = ray @ T[:3, :3].T + rho[:, None] * T[:3, 3]
     z = np.where(q[:, 2] > _MIN_DEPTH_RATIO, q[:, 2], np.nan)
     uv = q[:, :2] / z[:, None]
@@ -246,40 +264,55 @@ class _AlignedPose(NamedTuple):
     depth_scale: DepthScale | None
 
 
+def _shared_sigma(query: ImageView, candidate: ImageView) -> float:
+    """Return the sigma of the relative scale of both views' depths that many features do not average out."""
+    return float(np.hypot(query.shared_depth_sigma, candidate.shared_depth_sigma))
+
+
 def _fit_pose(
     T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
 ) -> _AlignedPose:
-    """Fit the pose to all aligned positions. size: px of the image per px of the level. Raises LinAlgError
-    where they do not determine it."""
+    """Fit the pose, and the scale of either view's depths, to all aligned positions. size: px of the image
+    per px of the level. Raises LinAlgError where they do not determine it."""
+    scale_sigma = np.array([query.shared_depth_sigma, candidate.shared_depth_sigma])
+    prior = np.diag(np.concatenate([np.full(6, _RIDGE), scale_sigma**-2]))
+    log_scales = np.zeros(2)  # of the query's depths and the candidate's
     for _ in range(_ITERATIONS):
-        at_candidate = _residuals(T, query, candidate, forward, size)
-        at_query = _residuals(se3.inverse(T), candidate, query, backward, size)
+        at_candidate = _residuals(T, query, candidate, forward, size, log_scales[0])
+        at_query = _residuals(se3.inverse(T), candidate, query, backward, size, log_scales[1])
         r = np.concatenate([at_candidate.r, at_query.r])
-        J = np.concatenate([at_candidate.J_pose, at_query.J_pose @ -se3.adjoint(se3.inverse(T))])
+        J, split = np.zeros((len(r), 2, 8)), len(at_candidate.r)
+        J[:, :, :6] = np.concatenate([at_candidate.J_pose, at_query.J_pose @ -se3.adjoint(se3.inverse(T))])
+        J[:split, :, 6], J[split:, :, 7] = at_candidate.J_scale, at_query.J_scale
         chi2 = (r * r).sum(axis=1)
         root_weight = 1 / np.sqrt(1 + chi2 / _CAUCHY**2)
-        A = (J * root_weight[:, None, None]).reshape(-1, 6)
-        information = A.T @ A + _RIDGE * np.eye(6)
-        step = np.linalg.solve(information, A.T @ (r * root_weight[:, None]).ravel())
-        T = se3.exp(step) @ T
+        A = (J * root_weight[:, None, None]).reshape(-1, 8)
+        information = A.T @ A + prior
+        gradient = A.T @ (r * root_weight[:, None]).ravel()
+        gradient[6:] -= log_scales / scale_sigma**2
+        step = np.linalg.solve(information, gradient)
+        T, log_scales = se3.exp(step[:6]) @ T, log_scales + step[6:]
         if np.abs(step).max() < _CONVERGED_STEP * size:
             break
-    inlier = chi2 < _INLIER_CHI2
-    J_scale = np.concatenate([at_candidate.J_scale, np.zeros_like(at_query.J_scale)])
-    depth_scale = _depth_scale(J[inlier], J_scale[inlier], r[inlier])
-    return _AlignedPose(T, np.linalg.inv(information), int(inlier.sum()), depth_scale)
+    inlier, cov = chi2 < _INLIER_CHI2, np.linalg.inv(information)
+    depth_scale = _depth_scale(J[inlier], r[inlier], log_scales)
+    if depth_scale is not None:
+        pose_sensitivity = cov[:6, 6] / scale_sigma[0] ** 2
+        depth_scale = DepthScale(*depth_scale[:2], pose_sensitivity, _shared_sigma(query, candidate))
+    return _AlignedPose(T, cov[:6, :6], int(inlier.sum()), depth_scale)
 
 
-def _depth_scale(J: F64, J_scale: F64, r: F64) -> DepthScale | None:
-    """Return the scale of the query's depths by residuals r (M, 2) at the pose's fit: one more unknown."""
+def _depth_scale(J: F64, r: F64, log_scales: F64) -> DepthScale | None:
+    """Return the scale of the query's depths over the candidate's by residuals r (M, 2) at the fit, with
+    nothing known of it before. J (M, 2, 8) and log_scales (2,): of the fit."""
     if len(r) < _MIN_INLIERS:
         return None
-    A = np.concatenate([J, J_scale[:, :, None]], axis=2).reshape(-1, 7)
+    A = J[:, :, :7].reshape(-1, 7)
     normal = A.T @ A + _RIDGE * np.eye(7)
-    log_scale = float(np.linalg.solve(normal, A.T @ r.ravel())[6])
+    log_scale = float(log_scales[0] - log_scales[1] + np.linalg.solve(normal, A.T @ r.ravel())[6])
     variance = max(1.0, float((r * r).sum()) / max(1, 2 * len(r) - 7))
     sigma = float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
-    return DepthScale(log_scale, sigma, -np.linalg.solve(normal[:6, :6], normal[:6, 6]))
+    return DepthScale(log_scale, sigma)
 
 
 class _Residuals(NamedTuple):
@@ -292,10 +325,10 @@ class _Residuals(NamedTuple):
 
 
 def _residuals(
-    T: F64, source: ImageView, target: ImageView, alignment: _Alignment, size: float
+    T: F64, source: ImageView, target: ImageView, alignment: _Alignment, size: float, log_scale: float
 ) -> _Residuals:
     index = alignment.feature
-    uv, D, q, rho = _transfer(T, source, index)
+    uv, D, q, rho = _transfer(T, source, index, log_scale)
     J_px = target.camera.jacobian(uv) @ D
     by_rho = J_px @ T[:3, 3]  # px per 1/m
     J = np.empty((len(index), 2, 8))  # by the pose, by the log of the depth, and the residual
