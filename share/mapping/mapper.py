@@ -1,7 +1,7 @@
 """The mapper: keyframes in, corrections out.
 
-A keyframe's way (`Mapper._look_up`): describe its image -> align it with the images near it in its map ->
-query -> review recent merges -> for each candidate verify -> merge gate -> agreement of the agents -> loop
+A keyframe's way (`Mapper._look_up`): align its image with those near it in its map -> describe it -> query
+-> review recent merges -> align or verify each candidate -> merge gate -> agreement of the agents -> loop
 acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
 localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values that the
 caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved together
@@ -18,13 +18,14 @@ from share.config import Config
 from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
 from share.mapping.atlas import Atlas
+from share.mapping.candidates import choose_checks, larger_maps_first
 from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, StoredMap
 from share.mapping.map_solving import AppliedSolution
 from share.mapping.mapper_counters import MapperCounters
-from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, rank_candidates, service_kind
+from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, service_kind
 from share.mapping.recognition.keyframe_views import KeyframeViews
 from share.mapping.recognition.nearby import nearby_candidates
 from share.mapping.recognition.verification import Refusal, Verification
@@ -206,11 +207,12 @@ class Mapper:
 
     def _look_up(self, node_id: int) -> Job:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
-        yield from self._describe(node_id)
         is_aligned = yield from self._align_nearby(node_id)
-        if is_aligned and len(self.atlas.map_sizes()) == 1 and node_id % _RECHECK_INTERVAL:
-            return  # the map is right here, and there is no other to find
-        yield from self._query(node_id)
+        has_time = len(self.atlas.map_sizes()) > 1 and not self._queries.is_hurried  # to find other maps
+        if is_aligned and not has_time and node_id % _RECHECK_INTERVAL:
+            return  # the map is right here; it is described when nothing waits
+        yield from self._describe(node_id)
+        yield from self._query(node_id, is_aligned)
 
     def _describe(self, node_id: int) -> Job:
         """Find the ORB features of a keyframe that came as an image only."""
@@ -229,26 +231,15 @@ class Mapper:
         views, is_aligned = self._views, False
         if views.image(node_id) is None:
             return False
-        agent = self.atlas.key(node_id).agent
         for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image())[
             : 1 if self._queries.is_hurried else None
         ]:
-            images = views.image(node_id), views.image(candidate)
-            if images[0] is None or images[1] is None:
-                continue  # removed meanwhile
-            T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
-            try:
-                outcome = yield AlignStep(node_id, images[0], candidate, images[1], T_c_q)
-                is_kept = {node_id, candidate} <= views.by_node.keys()
-                events = self._judge_candidate(None, node_id, candidate, outcome) if is_kept else []
-                is_aligned |= isinstance(outcome, Verification)
-            except Exception as error:  # costs this candidate only
-                events = self.report_failure(AlignStep.kind, error, agent)
-            yield events
+            if {node_id, candidate} <= views.by_node.keys():  # else removed meanwhile
+                is_aligned |= yield from self._check(self._align_step(node_id, candidate), None)
         return is_aligned
 
-    def _query(self, node_id: int) -> Job:
-        """Query with a keyframe and verify the candidates; each verified loop is gated, checked and added."""
+    def _query(self, node_id: int, is_aligned: bool) -> Job:
+        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`."""
         views, place = self._views.by_node, self._config.place
         if node_id not in views:
             return  # removed meanwhile
@@ -257,23 +248,51 @@ class Mapper:
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self.atlas.quarantine.quarantined_nodes(agent)
         found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
-        candidates = [candidate.id for candidate in found]
+        if node_id not in views:
+            yield []
+            return
+        by_map, by_looks = choose_checks(
+            self.atlas.graph,
+            node_id,
+            [candidate.id for candidate in found if candidate.id in views],
+            self._views.with_image(),
+            is_aligned,
+            is_recheck=node_id % _RECHECK_INTERVAL == 0,
+        )
         if self._queries.is_hurried:
-            known = [n for n in candidates if n in views]
-            candidates = rank_candidates(self.atlas.graph, node_id, known)
+            by_looks = larger_maps_first(self.atlas.graph, by_looks)
         yield self._review_joins(node_id)
-        search = CandidateSearch(candidates)
+        search = CandidateSearch([*by_map, *by_looks])
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
-            if not {node_id, candidate} <= views.keys():
-                continue  # removed meanwhile
-            try:
-                images = self._views.image(node_id), self._views.image(candidate)
-                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
-                is_kept = {node_id, candidate} <= views.keys()
-                events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
-            except Exception as error:  # costs this candidate only
-                events = self.report_failure(VerifyStep.kind, error, agent)
-            yield events
+            if {node_id, candidate} <= views.keys():  # else removed meanwhile
+                make_step = self._align_step if candidate in by_map else self._verify_step
+                yield from self._check(make_step(node_id, candidate), search)
+
+    def _align_step(self, node_id: int, candidate: int) -> AlignStep:
+        images = self._views.image(node_id), self._views.image(candidate)
+        assert images[0] is not None and images[1] is not None
+        T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
+        return AlignStep(node_id, images[0], candidate, images[1], T_c_q)
+
+    def _verify_step(self, node_id: int, candidate: int) -> VerifyStep:
+        views, images = self._views.by_node, (self._views.image(node_id), self._views.image(candidate))
+        return VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
+
+    def _check(
+        self, step: AlignStep | VerifyStep, search: CandidateSearch | None
+    ) -> Generator[Any, Any, bool]:
+        """Run the step on a candidate and decide on what it finds: gate the loop, check it and add it. Return
+        whether it is verified."""
+        node_id, candidate, outcome = step.node_id, step.candidate_id, None
+        agent = self.atlas.key(node_id).agent
+        try:
+            outcome = yield step
+            is_kept = {node_id, candidate} <= self._views.by_node.keys()
+            events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
+        except Exception as error:  # costs this candidate only
+            events = self.report_failure(step.kind, error, agent)
+        yield events
+        return isinstance(outcome, Verification)
 
     def _judge_candidate(
         self, search: CandidateSearch | None, node_id: int, candidate: int, outcome: Verification | Refusal
