@@ -1,8 +1,8 @@
 """The mapper: keyframes in, corrections out.
 
 A keyframe's way (`Mapper._look_up`): align its image with those near it in its map -> describe it -> query
--> review recent merges -> align or verify each candidate -> merge gate -> agreement of the agents -> loop
-acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
+-> review recent merges -> align or verify each candidate -> agreement of the agents -> loop acceptance. The
+merge gate is before an alignment. A map that has changed (`Mapper._solve_map`): optimise ->
 localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values that the
 caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved together
 afterwards.
@@ -41,7 +41,7 @@ from share.mapping.steps import (
     VerifyStep,
 )
 from share.scheduling.merge_gate import MergeGate
-from share.types import Keyframe, View
+from share.types import F64, Keyframe, View
 from share.wire.messages import Hello
 
 _RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
@@ -62,7 +62,7 @@ class Mapper:
         self._lookup, self._solve = StepRunner(), StepRunner()
         self._changes: list[MapChange] = []
         self._empty_runs: list[KeyframeKey] = []
-        self._failures: list[MapEvent] = []
+        self._events: list[MapEvent] = []
         self._counters = MapperCounters()
 
     # Runs
@@ -175,7 +175,7 @@ class Mapper:
             try:
                 return cast(SolveStep, self._solve.next_step())
             except Exception as error:  # only this map stays unsolved
-                self._failures += self.report_failure(SolveStep.kind, error, map_id=map_id)
+                self._events += self.report_failure(SolveStep.kind, error, map_id=map_id)
         return None
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
@@ -198,19 +198,19 @@ class Mapper:
         reason = f"{where}{what}: {describe_exception(error)}"
         return [MapEvent(agent, "step failed", reason, map_id=map_id)]
 
-    def take_failures(self) -> list[MapEvent]:
-        """Return the failures since the last call that no other method has returned."""
-        failures, self._failures = self._failures, []
-        return failures
+    def take_events(self) -> list[MapEvent]:
+        """Return the events since the last call that no other method has returned."""
+        events, self._events = self._events, []
+        return events
 
     # A keyframe's way through the map
 
     def _look_up(self, node_id: int) -> Job:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
         is_aligned = yield from self._align_nearby(node_id)
-        has_time = len(self.atlas.map_sizes()) > 1 and not self._queries.is_hurried  # to find other maps
-        if is_aligned and not has_time and node_id % _RECHECK_INTERVAL:
-            return  # the map is right here; it is described when nothing waits
+        seeks_maps = len(self.atlas.map_sizes()) > 1 and not self._queries.is_hurried
+        if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
+            return  # the map is right here; the keyframe is described when nothing waits
         yield from self._describe(node_id)
         yield from self._query(node_id, is_aligned)
 
@@ -231,11 +231,13 @@ class Mapper:
         views, is_aligned = self._views, False
         if views.image(node_id) is None:
             return False
-        for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image())[
-            : 1 if self._queries.is_hurried else None
-        ]:
-            if {node_id, candidate} <= views.by_node.keys():  # else removed meanwhile
-                is_aligned |= yield from self._check(self._align_step(node_id, candidate), None)
+        for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image()):
+            if is_aligned and self._queries.is_hurried:
+                break
+            if not {node_id, candidate} <= views.by_node.keys():
+                continue  # removed meanwhile
+            if (step := self._align_step(node_id, candidate)) is not None:
+                is_aligned |= yield from self._check(step, None)
         return is_aligned
 
     def _query(self, node_id: int, is_aligned: bool) -> Job:
@@ -266,13 +268,26 @@ class Mapper:
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
             if {node_id, candidate} <= views.keys():  # else removed meanwhile
                 make_step = self._align_step if candidate in by_map else self._verify_step
-                yield from self._check(make_step(node_id, candidate), search)
+                if (step := make_step(node_id, candidate)) is not None:
+                    yield from self._check(step, search)
 
-    def _align_step(self, node_id: int, candidate: int) -> AlignStep:
+    def _align_step(self, node_id: int, candidate: int) -> AlignStep | None:
+        """Step that aligns two keyframes of a map; None where the merge gate leaves it out."""
+        T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
+        a, b = self.atlas.key(candidate), self.atlas.key(node_id)
+        if objection := self._merge_gate.skip_reason(self._overlap_volume(a, b, T_c_q), same_map=True):
+            merges = self._counters.runs[b.agent].merges
+            merges["requested"] += 1
+            merges["skipped"] += 1
+            self._events.append(MapEvent(b.agent, "merge skipped", f"loop {a} - {b}: {objection}"))
+            return None
         images = self._views.image(node_id), self._views.image(candidate)
         assert images[0] is not None and images[1] is not None
-        T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
         return AlignStep(node_id, images[0], candidate, images[1], T_c_q)
+
+    def _overlap_volume(self, a: KeyframeKey, b: KeyframeKey, T_a_b: F64) -> float:
+        rig_a, rig_b = (self._hellos[key.agent].rig for key in (a, b))
+        return self._merge_gate.overlap_volume(rig_a, rig_b, T_a_b)
 
     def _verify_step(self, node_id: int, candidate: int) -> VerifyStep:
         views, images = self._views.by_node, (self._views.image(node_id), self._views.image(candidate))
@@ -281,8 +296,7 @@ class Mapper:
     def _check(
         self, step: AlignStep | VerifyStep, search: CandidateSearch | None
     ) -> Generator[Any, Any, bool]:
-        """Run the step on a candidate and decide on what it finds: gate the loop, check it and add it. Return
-        whether it is verified."""
+        """Run the step on a candidate and decide on what it finds. Return whether it is verified."""
         node_id, candidate, outcome = step.node_id, step.candidate_id, None
         agent = self.atlas.key(node_id).agent
         try:
@@ -297,7 +311,7 @@ class Mapper:
     def _judge_candidate(
         self, search: CandidateSearch | None, node_id: int, candidate: int, outcome: Verification | Refusal
     ) -> list[MapEvent]:
-        """Decide on a verified candidate: count, gate, compare the agents, check the loop and add it."""
+        """Decide on a verified candidate: count, compare the agents, check the loop and add it."""
         atlas, a, b = self.atlas, self.atlas.key(candidate), self.atlas.key(node_id)
         counters = self._counters.runs[b.agent]
         counters.loops_tried += 1
@@ -307,12 +321,6 @@ class Mapper:
             search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         counters.merges["requested"] += 1
-        volume = self._merge_gate.overlap_volume(
-            self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b
-        )
-        if objection := self._merge_gate.skip_reason(volume, atlas.map_id(a) == atlas.map_id(b)):
-            counters.merges["skipped"] += 1
-            return [MapEvent(b.agent, "merge skipped", f"loop {loop}: {objection}")]
         change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
         self._record_loops(change)
         events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
@@ -322,7 +330,7 @@ class Mapper:
         if not decision.accepted:
             return [*events, MapEvent(b.agent, "loop not accepted", reason)]
         counters.merges["done"] += 1
-        self._merge_gate.record_merge(volume)
+        self._merge_gate.record_merge(self._overlap_volume(a, b, loop.T_a_b))
         undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
         accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
         return [*events, *undone, accepted]

@@ -91,7 +91,8 @@ def test_two_agents_join_by_their_images_and_are_then_aligned_by_the_map(place: 
     for _, sent in bob:
         mapper.add_keyframe("bob", sent)
         done = work(mapper)
-        assert isinstance(done[0][0], DescribeStep) and len(done[0][1]) > 200
+        [view] = [outcome for step, outcome in done if isinstance(step, DescribeStep)]
+        assert len(view) > 200
         assert all(step.query_image is not None for step, _ in done if isinstance(step, VerifyStep))
         aligned.append([outcome for step, outcome in done if isinstance(step, AlignStep)])
         if not aligned[-1]:
@@ -126,11 +127,12 @@ def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(place
     for _, sent in bob[:8]:
         mapper.add_keyframe("bob", sent)
         done = work(mapper)
-        looks.append(("align" in kinds(done), "place" in kinds(done), done[0][0].node_id))
-    joined = looks[[is_aligned for is_aligned, *_ in looks].index(True) :]
+        looks.append((kinds(done), done[0][0].node_id))
+    joined = looks[["align" in done for done, _ in looks].index(True) :]
     assert len(joined) >= 4
-    for is_aligned, is_queried, node_id in joined:
-        assert is_aligned and is_queried == (node_id % 4 == 0)
+    for done, node_id in joined:
+        assert "align" in done and ("place" in done) == (node_id % 4 == 0)
+        assert "place" in done or done[-1] == "describe"  # when nothing waits
     elsewhere = keyframes(Planes(ROOM, seed=9), 0.0, 3, steps=1)
     mapper.add_keyframe("eve", elsewhere[0][1])
     work(mapper)

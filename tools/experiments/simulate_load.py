@@ -1,13 +1,14 @@
 """Corrections of one edge with many agents, in virtual time: real agents, edge, mapper and solver.
 
     python tools/experiments/simulate_load.py SESSION [--agents 3 8 24] [--seconds 30] [--policy share] \\
-        [--seeds 0:1] [--link wifi5] [--json FILE]
+        [--seed 0] [--link wifi5] [--json FILE]
 
-The agents replay the keyframes of an emulated session (`replayed_agents`). Every step of mapper and solver
-takes the CPU time that it takes on this machine, each in a process of its own; other delays are drawn. So other
-work on the machine hardly matters; compare figures of one machine only. The first 5 s do not count. Prints a
-Markdown table: from a keyframe's frame to the correction that answers it, ms; keyframes at the edge a second;
-of those the share looked up and answered; load of mapper and solver; CPU ms a keyframe, and by kind of step.
+The agents replay the keyframes of an emulated session (`replayed_agents`). The work of mapper and solver,
+each in a process of its own, takes the CPU time that it takes on this machine; other delays are drawn. Busy
+neighbours make CPU time up to half as long again: compare runs side by side. The first 5 s do not count.
+Prints a Markdown table: from a keyframe's frame to the correction that answers it, ms; keyframes at the
+edge a second, and of these the share looked up and answered; load of mapper and solver; the mapper's CPU
+time a keyframe, ms, and by kind of work; maps at the end.
 """
 
 from __future__ import annotations
@@ -43,8 +44,6 @@ HEAD += ("solver", "mapper ms a keyframe", "by step", "maps")
 _COUNTED_FROM_S = 5.0
 
 Row = dict[str, Any]
-
-
 
 
 class ChargedSimulation(Simulation):
@@ -90,9 +89,7 @@ class ChargedSimulation(Simulation):
         self._schedule(spent_ns + took_ns, lambda: self._step_done(step, result))
 
     def _step_done(self, step: Any, result: object) -> None:
-        found, took_ns = self._charge_mapper(
-            "judge", partial(self.mapper.finish_step, step, result, 0.0)
-        )
+        found, took_ns = self._charge_mapper("judge", partial(self.mapper.finish_step, step, result, 0.0))
 
         def go_on() -> None:
             self._send_findings(found)
@@ -141,9 +138,7 @@ def play(tracks: list[Track], count: int, seconds: float, config: Config, link: 
     """Simulate `count` agents and return the figures."""
     agents = [ReplayedAgent(tracks, index) for index in range(count)]
     links = LinkAssignment.parse(link)
-    members = [
-        (agent.hello, agent.frames(seconds), links.network_for(agent.hello.name)) for agent in agents
-    ]
+    members = [(agent.hello, agent.frames(seconds), links.network_for(agent.hello.name)) for agent in agents]
     world = ChargedSimulation(config, members, ProcessingDelays(), seed)
     world.run(seconds + 1.0)
     report = world.edge.report(world.mapper.report())

@@ -327,7 +327,7 @@ class Simulation:
         return Delay(verified.p50 + checked.p50, verified.p95 + checked.p95)
 
     def _send_findings(self, findings: list[MapEvent]) -> None:
-        findings, changes = [*findings, *self.mapper.take_failures()], self.mapper.take_changes()
+        findings, changes = [*findings, *self.mapper.take_events()], self.mapper.take_changes()
         if findings or changes:
             self._to_edge(ed.MapperResult(tuple(findings), changes))
 

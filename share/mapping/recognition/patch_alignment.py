@@ -74,14 +74,15 @@ class ImageView:
         half = np.asarray(cv2.pyrDown(self.pixels), np.uint8)
         return self.pixels, half, np.asarray(cv2.pyrDown(half), np.uint8)
 
-    def patches(self, level: int) -> patches.Patches:
-        """Patches of the features, from this image of `pyramid`."""
-        if level not in self._patches:
-            self._patches[level] = patches.extract(self.pyramid[level], self.px / np.float32(2**level))
-        return self._patches[level]
+    def kernels(self, level: int) -> F32:
+        """Kernels (N, 3, S) of the features' patches, from this image of `pyramid`."""
+        if level not in self._kernels:
+            px = self.px / np.float32(2**level)
+            self._kernels[level] = patches.extract_kernels(self.pyramid[level], px)
+        return self._kernels[level]
 
     @cached_property
-    def _patches(self) -> dict[int, patches.Patches]:
+    def _kernels(self) -> dict[int, F32]:
         return {}
 
     @cached_property
@@ -238,7 +239,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
     if len(index) == 0:
         return _Alignment(index, np.zeros((0, 2)), 0)
     size = 2.0**level
-    kernels = source.patches(level).kernels[index]
+    kernels = source.kernels(level)[index]
     images = (target.pyramid[level],)
     aligned = patches.align(images, len(index), kernels, px[index] / size, warp[index], _MAX_STEPS)
     distance_px = np.hypot(*(aligned.px - px[index] / size).T)

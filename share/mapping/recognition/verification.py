@@ -1,7 +1,8 @@
 """Verification of a candidate: the relative pose of two views, or the reason why there is none.
 
-Descriptors have to match, some of them closely; either view's 3D points have to give a pose in the other's image (PnP), both poses
-have to agree, and the result must not contradict gravity. A refusal says which check failed and by how much.
+Descriptors have to match, some of them closely; either view's 3D points have to give a pose in the other's
+image (PnP), both poses have to agree, and the result must not contradict gravity. A refusal says which check
+failed and by how much.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _MIN_DEPTH_M, _MAX_DEPTH_M = 0.05, 1000.0  # other depths count as unknown
 
 
 CLOSE_BITS = 40  # largest Hamming distance of a close match
-MIN_CLOSE_MATCHES = 16  # of one place there are 20 or more, else two of three candidates have fewer
+MIN_CLOSE_MATCHES = 12  # all verified pairs had more, every second other candidate fewer
 MAX_BITS = 64  # largest Hamming distance of a match, of 256
 MIN_MATCHES = 20  # mutual nearest neighbours required before geometry is tried
 RANSAC_PX = 6.0  # reprojection error of a RANSAC inlier
