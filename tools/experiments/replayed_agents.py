@@ -55,7 +55,8 @@ class ReplayedAgent:
         """Yield its frames in this time; they arrive from 0 on."""
         frames = self._track.frames
         period_ns = (frames[-1].arrival_ns - frames[0].arrival_ns) // (len(frames) - 1)
-        first = int(self._rng.integers(len(frames)))
+        needed = round(seconds * 1e9 / period_ns)
+        first = int(self._rng.integers(max(1, len(frames) - needed)))  # so that a long track is walked once
         is_begun = False  # the present segment has a keyframe
         start_ns = int(self._rng.integers(period_ns))
         for k, arrival_ns in enumerate(range(start_ns, round(seconds * 1e9), period_ns), first):

@@ -5,7 +5,7 @@
 
 The agents replay the keyframes of an emulated session (`replayed_agents`). The work of mapper and solver,
 each in a process of its own, takes the CPU time that it takes on this machine; other delays are drawn. Busy
-neighbours make CPU time up to half as long again: compare runs side by side. The first 5 s do not count.
+neighbours make CPU time up to half as long again: compare runs side by side. The first 10 s do not count.
 Prints a Markdown table: from a keyframe's frame to the correction that answers it, ms; keyframes at the
 edge a second, and of these the share looked up and answered; load of mapper and solver; the mapper's CPU
 time a keyframe, ms, and by kind of work; maps at the end.
@@ -41,7 +41,7 @@ from share.recordings.session import read_session  # noqa: E402
 
 HEAD = ("agents", "corrections: p50, p95 ms", "keyframes a second", "looked up", "answered", "mapper")
 HEAD += ("solver", "mapper ms a keyframe", "by step", "maps")
-_COUNTED_FROM_S = 5.0
+_COUNTED_FROM_S = 10.0
 
 Row = dict[str, Any]
 
