@@ -12,7 +12,7 @@ from helpers import textured_planes
 from helpers.hellos import NOISE, hello_of
 from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
 
-from share.config import Config
+from share.config import Config, ControlConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.mapping.graph.solver import PoseGraphSolver
@@ -53,8 +53,8 @@ def place() -> Planes:
     return Planes(ROOM, seed=3)
 
 
-def mapper_of(*names: str) -> Mapper:
-    mapper = Mapper(Config())
+def mapper_of(*names: str, control: ControlConfig | None = None) -> Mapper:
+    mapper = Mapper(Config(control=control or ControlConfig()))
     for k, name in enumerate(names):
         mapper.add_run(name, replace(hello_of(name, k + 1), rig=RIG))
     return mapper
@@ -139,6 +139,22 @@ def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(place
     for _, sent in bob[8:10]:
         mapper.add_keyframe("bob", sent)
         assert {"align", "place"} <= set(kinds(work(mapper)))
+
+
+@pytest.mark.long
+def test_what_the_merge_gate_skips_is_not_aligned(place: Planes) -> None:
+    """With an eagerness of nothing it skips all once there was a merge; the gate needs no image."""
+    mapper = mapper_of("ann", "bob", control=ControlConfig(eagerness=0.0))
+    for name, run in (("ann", keyframes(place, -0.1, 1)), ("bob", keyframes(place, 0.0, 2, steps=7))):
+        for _, sent in run:
+            mapper.add_keyframe(name, sent)
+            done = work(mapper)
+            assert "align" not in kinds(done)
+    merges = mapper.report()["merges"]
+    assert mapper.atlas.map_sizes() == {"ann/0": 11}
+    assert 0 < merges["skipped"] < merges["requested"] and merges["done"] > 0
+    events = mapper.take_events()
+    assert len(events) == merges["skipped"] and {event.event for event in events} == {"merge skipped"}
 
 
 def test_a_keyframe_that_waits_is_described_for_the_queries_of_others(place: Planes) -> None:
