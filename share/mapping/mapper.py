@@ -1,8 +1,8 @@
 """The mapper: keyframes in, corrections out.
 
-A keyframe's way (`Mapper._look_up`): describe its image -> align it with the images near it in its map ->
-query -> review recent merges -> for each candidate verify -> merge gate -> agreement of the agents -> loop
-acceptance. A map that has changed (`Mapper._solve_map`): optimise ->
+A keyframe's way (`Mapper._look_up`): align its image with those near it in its map -> describe it -> query
+-> review recent merges -> align or verify each candidate -> agreement of the agents -> loop acceptance. The
+merge gate is before an alignment. A map that has changed (`Mapper._solve_map`): optimise ->
 localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values that the
 caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved together
 afterwards.
@@ -18,6 +18,7 @@ from share.config import Config
 from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
 from share.mapping.atlas import Atlas
+from share.mapping.candidates import choose_checks, larger_maps_first
 from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
@@ -31,7 +32,7 @@ from share.mapping.map_changes import (
 )
 from share.mapping.map_solving import AppliedSolution
 from share.mapping.mapper_counters import MapperCounters
-from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, rank_candidates, service_kind
+from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, service_kind
 from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeArchive, KeyframeViews
 from share.mapping.recognition.nearby import nearby_candidates
 from share.mapping.recognition.verification import Refusal, Verification
@@ -48,7 +49,7 @@ from share.mapping.steps import (
     VerifyStep,
 )
 from share.scheduling.merge_gate import MergeGate
-from share.types import Keyframe, View
+from share.types import F64, Keyframe, View
 from share.wire.messages import Hello
 
 _RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
@@ -70,7 +71,7 @@ class Mapper:
         self._lookup, self._solve = StepRunner(), StepRunner()
         self._changes: list[MapChange] = []
         self._empty_runs: list[KeyframeKey] = []
-        self._failures: list[MapEvent] = []
+        self._events: list[MapEvent] = []
         self._counters = MapperCounters()
 
     # Runs
@@ -186,7 +187,7 @@ class Mapper:
             try:
                 return cast(SolveStep, self._solve.next_step())
             except Exception as error:  # only this map stays unsolved
-                self._failures += self.report_failure(SolveStep.kind, error, map_id=map_id)
+                self._events += self.report_failure(SolveStep.kind, error, map_id=map_id)
         return None
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
@@ -209,10 +210,10 @@ class Mapper:
         reason = f"{where}{what}: {describe_exception(error)}"
         return [MapEvent(agent, "step failed", reason, map_id=map_id)]
 
-    def take_failures(self) -> list[MapEvent]:
-        """Return the failures since the last call that no other method has returned."""
-        failures, self._failures = self._failures, []
-        return failures
+    def take_events(self) -> list[MapEvent]:
+        """Return the events since the last call that no other method has returned."""
+        events, self._events = self._events, []
+        return events
 
     # A keyframe's way through the map
 
@@ -220,11 +221,12 @@ class Mapper:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
         if entries := self._views.next_restored():
             yield from self._index(entries)
-        yield from self._describe(node_id)
         is_aligned = yield from self._align_nearby(node_id)
-        if is_aligned and len(self.atlas.map_sizes()) == 1 and node_id % _RECHECK_INTERVAL:
-            return  # the map is right here, and there is no other to find
-        yield from self._query(node_id)
+        seeks_maps = len(self.atlas.map_sizes()) > 1 and not self._queries.is_hurried
+        if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
+            return  # the map is right here; the keyframe is described when nothing waits
+        yield from self._describe(node_id)
+        yield from self._query(node_id, is_aligned)
 
     def _index(self, entries: Sequence[IndexEntry]) -> Job:
         """Index restored keyframes."""
@@ -243,34 +245,26 @@ class Mapper:
             raise
         if (packed := self._views.describe(node_id, view)) is not None and len(packed):
             self._changes.append(SaveView(key, packed))
-        damaged = MapEvent(key.agent, "odometry suspect", f"keyframe {key.id}: its image is damaged: without it")
-        yield [*([] if image.is_intact else [damaged]), *self._review_joins(node_id)]
+        reason = f"keyframe {key.id}: its image is damaged: without it"
+        damaged = [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", reason)]
+        yield [*damaged, *self._review_joins(node_id)]
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""
         views, is_aligned = self._views, False
         if views.image(node_id) is None:
             return False
-        agent = self.atlas.key(node_id).agent
-        for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image())[
-            : 1 if self._queries.is_hurried else None
-        ]:
-            images = views.image(node_id), views.image(candidate)
-            if images[0] is None or images[1] is None:
+        for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image()):
+            if is_aligned and self._queries.is_hurried:
+                break
+            if not {node_id, candidate} <= views.by_node.keys():
                 continue  # removed meanwhile
-            T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
-            try:
-                outcome = yield AlignStep(node_id, images[0], candidate, images[1], T_c_q)
-                is_kept = {node_id, candidate} <= views.by_node.keys()
-                events = self._judge_candidate(None, node_id, candidate, outcome) if is_kept else []
-                is_aligned |= isinstance(outcome, Verification)
-            except Exception as error:  # costs this candidate only
-                events = self.report_failure(AlignStep.kind, error, agent)
-            yield events
+            if (step := self._align_step(node_id, candidate)) is not None:
+                is_aligned |= yield from self._check(step, None)
         return is_aligned
 
-    def _query(self, node_id: int) -> Job:
-        """Query with a keyframe and verify the candidates; each verified loop is gated, checked and added."""
+    def _query(self, node_id: int, is_aligned: bool) -> Job:
+        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`."""
         views, place = self._views.by_node, self._config.place
         if node_id not in views:
             return  # removed meanwhile
@@ -279,29 +273,69 @@ class Mapper:
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self.atlas.quarantine.quarantined_nodes(agent)
         found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
-        candidates = [candidate.id for candidate in found]
+        if node_id not in views:
+            yield []
+            return
+        by_map, by_looks = choose_checks(
+            self.atlas.graph,
+            node_id,
+            [candidate.id for candidate in found if candidate.id in views],
+            self._views.with_image(),
+            is_aligned,
+            is_recheck=node_id % _RECHECK_INTERVAL == 0,
+        )
         if self._queries.is_hurried:
-            known = [n for n in candidates if n in views]
-            candidates = rank_candidates(self.atlas.graph, node_id, known)
+            by_looks = larger_maps_first(self.atlas.graph, by_looks)
         has_image = self._views.image(node_id) is not None
         yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
-        search = CandidateSearch(candidates)
+        search = CandidateSearch([*by_map, *by_looks])
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
-            if not {node_id, candidate} <= views.keys():
-                continue  # removed meanwhile
-            try:
-                images = self._views.image(node_id), self._views.image(candidate)
-                outcome = yield VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
-                is_kept = {node_id, candidate} <= views.keys()
-                events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
-            except Exception as error:  # costs this candidate only
-                events = self.report_failure(VerifyStep.kind, error, agent)
-            yield events
+            if {node_id, candidate} <= views.keys():  # else removed meanwhile
+                make_step = self._align_step if candidate in by_map else self._verify_step
+                if (step := make_step(node_id, candidate)) is not None:
+                    yield from self._check(step, search)
+
+    def _align_step(self, node_id: int, candidate: int) -> AlignStep | None:
+        """Step that aligns two keyframes of a map; None where the merge gate leaves it out."""
+        T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
+        a, b = self.atlas.key(candidate), self.atlas.key(node_id)
+        if objection := self._merge_gate.skip_reason(self._overlap_volume(a, b, T_c_q), same_map=True):
+            merges = self._counters.runs[b.agent].merges
+            merges["requested"] += 1
+            merges["skipped"] += 1
+            self._events.append(MapEvent(b.agent, "merge skipped", f"loop {a} - {b}: {objection}"))
+            return None
+        images = self._views.image(node_id), self._views.image(candidate)
+        assert images[0] is not None and images[1] is not None
+        return AlignStep(node_id, images[0], candidate, images[1], T_c_q)
+
+    def _overlap_volume(self, a: KeyframeKey, b: KeyframeKey, T_a_b: F64) -> float:
+        rig_a, rig_b = (self._hellos[key.agent].rig for key in (a, b))
+        return self._merge_gate.overlap_volume(rig_a, rig_b, T_a_b)
+
+    def _verify_step(self, node_id: int, candidate: int) -> VerifyStep:
+        views, images = self._views.by_node, (self._views.image(node_id), self._views.image(candidate))
+        return VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
+
+    def _check(
+        self, step: AlignStep | VerifyStep, search: CandidateSearch | None
+    ) -> Generator[Any, Any, bool]:
+        """Run the step on a candidate and decide on what it finds. Return whether it is verified."""
+        node_id, candidate, outcome = step.node_id, step.candidate_id, None
+        agent = self.atlas.key(node_id).agent
+        try:
+            outcome = yield step
+            is_kept = {node_id, candidate} <= self._views.by_node.keys()
+            events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
+        except Exception as error:  # costs this candidate only
+            events = self.report_failure(step.kind, error, agent)
+        yield events
+        return isinstance(outcome, Verification)
 
     def _judge_candidate(
         self, search: CandidateSearch | None, node_id: int, candidate: int, outcome: Verification | Refusal
     ) -> list[MapEvent]:
-        """Decide on a verified candidate: count, gate, compare the agents, check the loop and add it."""
+        """Decide on a verified candidate: count, compare the agents, check the loop and add it."""
         atlas, a, b = self.atlas, self.atlas.key(candidate), self.atlas.key(node_id)
         counters = self._counters.runs[b.agent]
         counters.loops_tried += 1
@@ -311,12 +345,6 @@ class Mapper:
             search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         counters.merges["requested"] += 1
-        volume = self._merge_gate.overlap_volume(
-            self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b
-        )
-        if objection := self._merge_gate.skip_reason(volume, atlas.map_id(a) == atlas.map_id(b)):
-            counters.merges["skipped"] += 1
-            return [MapEvent(b.agent, "merge skipped", f"loop {loop}: {objection}")]
         change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
         self._record_loops(change)
         events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
@@ -326,7 +354,7 @@ class Mapper:
         if not decision.accepted:
             return [*events, MapEvent(b.agent, "loop not accepted", reason)]
         counters.merges["done"] += 1
-        self._merge_gate.record_merge(volume)
+        self._merge_gate.record_merge(self._overlap_volume(a, b, loop.T_a_b))
         undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
         accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
         return [*events, *undone, accepted]

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
-
-import numpy as np
+from collections.abc import Iterable
 
 from share.config import Config, EdgeConfig
-from share.geometry import se3
-from share.mapping.map_graph import MapGraph
 from share.scheduling.policies import POLICIES
 from share.scheduling.qoe import QoeParameters
-from share.types import F64, AgentKind
+from share.types import AgentKind
 from share.wire.messages import Hello
 
 HURRY_WAITING = 1  # with this many queued, a query verifies fewer candidates
@@ -143,30 +139,3 @@ class QueryQueue:
         if not queue:
             del self._waiting[agent]
         return node_id
-
-
-# Views of one map beyond either seldom share enough points.
-_FAR_M = 4.0
-_FAR_RAD = 1.0
-
-
-def rank_candidates(graph: MapGraph, node_id: int, others: Sequence[int]) -> list[int]:
-    """Sort candidates: those in larger maps first, so that agents end up in one map.
-
-    Last, but tried too, are those that this keyframe cannot see according to its map, which may be wrong.
-    """
-    nodes = graph.odometry.nodes
-    sizes: Counter[int] = Counter()
-    for segment, reference_segment in zip(graph.odometry.segments, graph.reference_segments, strict=True):
-        sizes[reference_segment] += len(segment.nodes)
-
-    def rank(other: int) -> tuple[bool, int]:
-        size = sizes[graph.reference_segments[nodes[other].segment]]
-        return graph.is_same_map(node_id, other) and _are_far(graph.poses[node_id], graph.poses[other]), -size
-
-    return sorted(others, key=rank)
-
-
-def _are_far(T_map_a: F64, T_map_b: F64) -> bool:
-    T = se3.inverse(T_map_a) @ T_map_b
-    return bool(np.linalg.norm(T[:3, 3]) > _FAR_M or se3.rotation_angle(T) > _FAR_RAD)

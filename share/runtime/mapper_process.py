@@ -193,7 +193,7 @@ class _MapperProcess:
 
     def _send_to_solver(self) -> None:
         step = self._guarded("solve", self._mapper.next_solve, None)
-        self._findings += self._mapper.take_failures()
+        self._findings += self._mapper.take_events()
         if step is not None:
             self._running_solve, self._solve_start_s = step, time.monotonic()
             self._solver.send(step)

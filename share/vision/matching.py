@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from share.types import I64, U8
 
 _BLOCK_ROWS = 50  # so that intermediate results stay in the cache
+_QUARTER_MARGIN = 5  # bits: two sigmas of those in a quarter of a descriptor of 40 that differ
 
 
 class DescriptorPairs(NamedTuple):
@@ -48,6 +49,25 @@ def pairs_within(distance: NDArray[np.uint16], max_bits: int) -> DescriptorPairs
     at = np.flatnonzero(distance <= max_bits)
     rows, cols = np.divmod(at, distance.shape[1])
     return DescriptorPairs(rows, cols, distance.ravel()[at])
+
+
+def close_pairs(a: U8, b: U8, max_bits: int) -> DescriptorPairs:
+    """Return nearly all pairs of descriptors in a (N, 32) and b (K, 32) that differ in at most `max_bits`, a
+    small number, in a third of the time of all distances: those that differ much in a quarter of the bits are
+    left out."""
+    if not len(a) or not len(b):
+        return DescriptorPairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint16))
+    first_a, first_b = (np.ascontiguousarray(x[:, :8]).view(np.uint64)[:, 0] for x in (a, b))
+    max_first = max_bits // 4 + _QUARTER_MARGIN
+    at = np.concatenate(
+        [
+            start * len(b) + np.flatnonzero(np.bitwise_count(block[:, None] ^ first_b) <= max_first)
+            for start, block in ((k, first_a[k : k + _BLOCK_ROWS]) for k in range(0, len(a), _BLOCK_ROWS))
+        ]
+    )
+    rows, cols = np.divmod(at, len(b))
+    pairs = DescriptorPairs(rows, cols, hamming_rowwise(a[rows], b[cols]).astype(np.uint16))
+    return pairs.keep(pairs.bits <= max_bits)
 
 
 def mutual_best(pairs: DescriptorPairs) -> DescriptorPairs:

@@ -13,7 +13,7 @@ from helpers import textured_planes
 from helpers.hellos import NOISE, hello_of
 from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
 
-from share.config import Config
+from share.config import Config, ControlConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.mapping.graph.solver import PoseGraphSolver
@@ -57,8 +57,8 @@ def place() -> Planes:
     return Planes(ROOM, seed=3)
 
 
-def mapper_of(*names: str) -> Mapper:
-    mapper = Mapper(Config())
+def mapper_of(*names: str, control: ControlConfig | None = None) -> Mapper:
+    mapper = Mapper(Config(control=control or ControlConfig()))
     for k, name in enumerate(names):
         mapper.add_run(name, replace(hello_of(name, k + 1), rig=RIG))
     return mapper
@@ -95,7 +95,8 @@ def test_two_agents_join_by_their_images_and_are_then_aligned_by_the_map(place: 
     for _, sent in bob:
         mapper.add_keyframe("bob", sent)
         done = work(mapper)
-        assert isinstance(done[0][0], DescribeStep) and len(done[0][1]) > 200
+        [view] = [outcome for step, outcome in done if isinstance(step, DescribeStep)]
+        assert len(view) > 200
         assert all(step.query_image is not None for step, _ in done if isinstance(step, VerifyStep))
         aligned.append([outcome for step, outcome in done if isinstance(step, AlignStep)])
         if not aligned[-1]:
@@ -137,11 +138,12 @@ def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(
     for _, sent in bob[:8]:
         mapper.add_keyframe("bob", sent)
         done = work(mapper)
-        looks.append(("align" in kinds(done), "place" in kinds(done), done[0][0].node_id))
-    joined = looks[[is_aligned for is_aligned, *_ in looks].index(True) :]
+        looks.append((kinds(done), done[0][0].node_id))
+    joined = looks[["align" in done for done, _ in looks].index(True) :]
     assert len(joined) >= 4
-    for is_aligned, is_queried, node_id in joined:
-        assert is_aligned and is_queried == (node_id % 4 == 0)
+    for done, node_id in joined:
+        assert "align" in done and ("place" in done) == (node_id % 4 == 0)
+        assert "place" in done or done[-1] == "describe"  # when nothing waits
     assert sorted(reviewed) == list(range(12))
     elsewhere = keyframes(Planes(ROOM, seed=9), 0.0, 3, steps=1)
     mapper.add_keyframe("eve", elsewhere[0][1])
@@ -149,6 +151,22 @@ def test_where_the_map_is_right_only_every_fourth_is_compared_by_its_looks(
     for _, sent in bob[8:10]:
         mapper.add_keyframe("bob", sent)
         assert {"align", "place"} <= set(kinds(work(mapper)))
+
+
+@pytest.mark.long
+def test_what_the_merge_gate_skips_is_not_aligned(place: Planes) -> None:
+    """With an eagerness of nothing it skips all once there was a merge; the gate needs no image."""
+    mapper = mapper_of("ann", "bob", control=ControlConfig(eagerness=0.0))
+    for name, run in (("ann", keyframes(place, -0.1, 1)), ("bob", keyframes(place, 0.0, 2, steps=7))):
+        for _, sent in run:
+            mapper.add_keyframe(name, sent)
+            done = work(mapper)
+            assert "align" not in kinds(done)
+    merges = mapper.report()["merges"]
+    assert mapper.atlas.map_sizes() == {"ann/0": 11}
+    assert 0 < merges["skipped"] < merges["requested"] and merges["done"] > 0
+    events = mapper.take_events()
+    assert len(events) == merges["skipped"] and {event.event for event in events} == {"merge skipped"}
 
 
 def test_a_keyframe_that_waits_is_described_for_the_queries_of_others(place: Planes) -> None:

@@ -58,8 +58,8 @@ def reason(query: CameraView, candidate: CameraView) -> str:
     return found.reason
 
 
-def test_another_place_has_too_few_matches() -> None:
-    assert reason(sights(3, T_C_Q)[0], sights(4, T_C_Q)[1]).endswith("matches of 20 needed")
+def test_another_place_has_too_few_close_matches() -> None:
+    assert reason(sights(3, T_C_Q)[0], sights(4, T_C_Q)[1]).endswith("close matches of 12 needed")
 
 
 def test_descriptors_without_geometry_are_refused() -> None:
@@ -120,8 +120,8 @@ def test_an_uncertain_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_empty_views_are_refused() -> None:
     empty = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
     query, candidate = sights(11, T_C_Q)
-    assert reason(replace(query, view=empty), candidate) == "0 matches of 20 needed"
-    assert reason(query, replace(candidate, view=empty)) == "0 matches of 20 needed"
+    assert reason(replace(query, view=empty), candidate) == "0 close matches of 12 needed"
+    assert reason(query, replace(candidate, view=empty)) == "0 close matches of 12 needed"
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -3,6 +3,7 @@ import numpy as np
 
 from share.vision.matching import (
     DescriptorPairs,
+    close_pairs,
     hamming_matrix,
     match_descriptors,
     mutual_best,
@@ -19,6 +20,22 @@ def test_hamming_agrees_with_opencv() -> None:
         for m in row:
             expected[m.queryIdx, m.trainIdx] = m.distance
     assert np.array_equal(hamming_matrix(a, b), expected)
+
+
+def test_close_pairs_are_those_of_all_that_differ_little() -> None:
+    """Nearly all: 95 % of those at the limit, and none beyond it."""
+    rng = np.random.default_rng(4)
+    a = rng.integers(0, 256, (300, 32), np.uint8)
+    bits = rng.permuted(np.arange(256) < 40, axis=0)[None] & np.ones((300, 1), bool)
+    b = a ^ np.packbits(rng.permuted(bits, axis=1), axis=1)
+    expected = pairs_within(hamming_matrix(a, b), 40)
+    found = close_pairs(a, b, 40)
+    assert len(expected.rows) == 300 and 285 <= len(found.rows) <= 300
+    assert {*zip(found.rows, found.cols, found.bits, strict=True)} <= {
+        *zip(expected.rows, expected.cols, expected.bits, strict=True)
+    }
+    assert len(close_pairs(a, b, 39).rows) == 0
+    assert len(close_pairs(a[:0], b, 40).rows) == len(close_pairs(a, b[:0], 40).rows) == 0
 
 
 def test_finds_the_permutation_of_noisy_descriptors() -> None:

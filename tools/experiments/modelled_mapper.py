@@ -202,7 +202,7 @@ class ModelledMapper:
             return []
         return self._accept_verified(step, result.T_c_q) if isinstance(result, Verification) else []
 
-    def take_failures(self) -> list[MapEvent]:
+    def take_events(self) -> list[MapEvent]:
         return []
 
     def take_changes(self) -> tuple[MapChange, ...]:

@@ -88,10 +88,10 @@ class ProcessingDelays:
     verify_accepted: Delay = Delay(4.0, 6.0)
     verify_refused: Delay = Delay(2.0, 5.0)
     describe: Delay = Delay(5.8, 8.1)
-    align_accepted: Delay = Delay(12.4, 17.3)
-    align_refused: Delay = Delay(1.7, 7.3)
-    verify_images_accepted: Delay = Delay(19.2, 27.1)
-    verify_images_refused: Delay = Delay(4.9, 9.3)
+    align_accepted: Delay = Delay(4.8, 6.9)
+    align_refused: Delay = Delay(4.0, 9.0)
+    verify_images_accepted: Delay = Delay(16.7, 24.0)
+    verify_images_refused: Delay = Delay(1.6, 9.3)
     check_loop: Delay = Delay(1.3, 10.0)
     solve: Delay = Delay(14.0, 32.0)
     apply_solution: Delay = Delay(2.2, 4.0)
@@ -327,7 +327,7 @@ class Simulation:
         return Delay(verified.p50 + checked.p50, verified.p95 + checked.p95)
 
     def _send_findings(self, findings: list[MapEvent]) -> None:
-        findings, changes = [*findings, *self.mapper.take_failures()], self.mapper.take_changes()
+        findings, changes = [*findings, *self.mapper.take_events()], self.mapper.take_changes()
         if findings or changes:
             self._to_edge(ed.MapperResult(tuple(findings), changes))
 

@@ -110,14 +110,15 @@ def _track_all(
     settings = Config(tracker=tracker, inertial=inertial, sequencer=sequencer)
     session = read_session(folder)
     return {
-        name: _track_agent(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns, error_source)
+        name: track_agent(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns, error_source)
         for name, agent in session.agents.items()
     }
 
 
-def _track_agent(
+def track_agent(
     source: Source, settings: Config, clock_offset_ns: int, error_source: str
 ) -> tuple[Rig, list[TrackedFrame]]:
+    """Return the rig and the tracked frames of a recording. error_source: as of `_track_all`."""
     tracker, errors = strict_tracker(source, settings), _error_estimator(source, error_source)
     frames = [
         TrackedFrame(

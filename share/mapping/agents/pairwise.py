@@ -216,22 +216,23 @@ def _solve(e: ComparisonEquations, covariance_scales: tuple[float, float]) -> Od
     walk_cov = _ODOMETRY_SIGMA_SCALE**2 * (scale_a * e.walk_cov_a + scale_b * e.walk_cov_b)
     loop_cov = _LOOP_SIGMA_SCALE**2 * e.loop_cov
     rows, prior = J.reshape(6 * n, 10), np.zeros((10, 10))
+    equations = np.column_stack([rows, xi.ravel()])
     prior[range(6, 10), range(6, 10)] = _PRIOR_SIGMAS**-2
     loop_information, weight = np.linalg.inv(loop_cov), np.ones(n)
     for _ in range(_IRLS_ITERATIONS):
         C = walk_cov.copy()
         C[range(n), :, range(n)] += loop_cov / weight[:, None, None]
-        information = np.linalg.inv(C.reshape(6 * n, 6 * n))
-        normal = rows.T @ information @ rows + prior
-        theta = np.linalg.solve(normal, rows.T @ information @ xi.ravel())
+        whitened = np.linalg.solve(C.reshape(6 * n, 6 * n), equations)  # times the information
+        normal = rows.T @ whitened[:, :10] + prior
+        theta = np.linalg.solve(normal, rows.T @ whitened[:, 10])
         residual = xi.ravel() - rows @ theta
-        weighted = (information @ residual).reshape(n, 6)
+        weighted = (whitened[:, 10] - whitened[:, :10] @ theta).reshape(n, 6)
         noise = (loop_cov @ weighted[:, :, None])[:, :, 0] / weight[:, None]  # the loops' part of it
         chi2 = np.einsum("ni,nij,nj->n", noise, loop_information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY_WIDTH_SQUARED)
     is_here = (np.abs(residual.reshape(n, 6)) < [_HERE_RAD] * 3 + [_HERE_M] * 3).all(axis=1)
     nis = float(np.median(chi2[is_here])) / _CHI2_6DOF_MEDIAN if is_here.any() else 0.0
-    misfit = float(residual @ information @ residual) / max(1, 6 * n - 10)  # shows a wrong model
+    misfit = float(residual @ weighted.ravel()) / max(1, 6 * n - 10)  # shows a wrong model
     cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
     rotation = theta[7:]
     chi = max(1e-6, float(rotation @ np.linalg.solve(cov[7:, 7:], rotation))) ** 0.5

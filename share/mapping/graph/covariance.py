@@ -30,8 +30,19 @@ class ShortestPaths:
         leaving = csc_array((np.ones(2 * e), ends, np.arange(2 * e + 1)), shape=(n, 2 * e)).tocsr()
         self._starts, order = leaving.indptr, leaving.indices  # sorted by start; parallel edges are kept
         self._targets, self._edge_index = others[order], order % max(e, 1)
-        self._cost = np.maximum(cost[self._edge_index], 1e-300)  # zero would mean no edge
-        self._graph = csr_array((self._cost, self._targets, self._starts), shape=(n, n))
+        self._graph = csr_array((self._directed(cost), self._targets, self._starts), shape=(n, n))
+
+    @property
+    def _cost(self) -> F64:
+        return np.asarray(self._graph.data)
+
+    def _directed(self, cost: F64) -> F64:
+        """Cost of every edge in both directions, sorted by start."""
+        return np.maximum(cost[self._edge_index], 1e-300)  # zero would mean no edge
+
+    def set_cost(self, cost: F64) -> None:
+        """Change the cost (E,) of the edges."""
+        self._graph.data = self._directed(cost)
 
     def predecessors(self, start: int) -> I64:
         """Return the pose before each (n,) on its path from `start`; negative for the start and unreachable
@@ -210,8 +221,8 @@ def relative_covariances(
 def _tightest_edges(n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I64) -> I64:
     """Indices of the edges on the paths of least covariance from the anchor to the wanted poses."""
     used, path_cost = np.zeros(len(edges), bool), cost.copy()
+    paths = ShortestPaths(n, edges.a, edges.b, path_cost)
     for _ in range(_MAX_ROUNDS):
-        paths = ShortestPaths(n, edges.a, edges.b, path_cost)
         predecessors = paths.predecessors(anchor)
         visited = poses_on_paths(predecessors, wanted)
         path_edges = paths.cheapest_edges(predecessors[visited], visited)
@@ -219,6 +230,7 @@ def _tightest_edges(n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I
         path_cost[path_edges] += 2 * cost[path_edges]
         if used.sum() >= MAX_EDGES:
             break
+        paths.set_cost(path_cost)
     return np.flatnonzero(used)
 
 

@@ -3,7 +3,8 @@
 The pose of a verified candidate rests on descriptors matched to a pixel. Here each feature of one keyframe is
 warped into the other's image by that pose and by the plane of its surface, and its patch is aligned there to
 a tenth of a pixel; the same the other way. The pose that explains all aligned positions is found by robust
-Gauss-Newton, on a pyramid from coarse to fine.
+Gauss-Newton. A pose by descriptors is first improved in a small image; that of a map is good enough to begin
+with the whole one.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from share.vision.keyframe_images import decompress
 from share.vision.orb import image_view
 
 ORB_FEATURES = 800  # found in a keyframe's image
-_LEVELS = (2, 1, 0)  # of the pyramid, coarse to fine: levels of half the size each
+_COARSE_TO_FINE = (2, 0)  # levels of the pyramid; each has half the size of the one before
+_FINE = (0,)
 _BORDER_PX = 6.0  # a patch's centre is at least so far inside the other image
 _REACH_PX = 5.0  # largest distance from the predicted position, px of the level
 _MIN_CORRELATION = 0.8
@@ -38,11 +40,9 @@ _CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
 _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
 _MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
 _ITERATIONS = 6
-_CONVERGED_STEP = 1e-4  # rad and m, at full size
-_MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = (
-    1e-3,
-    1.0,
-)  # relative; a baseline is calibrated no better than the first
+_CONVERGED_STEP = 3e-4  # rad and m, at full size
+# relative; a baseline is calibrated no better than the first
+_MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = 1e-3, 1.0
 _MIN_RHO = 1e-6  # 1/m
 _NOT_VISIBLE = 1e3  # whitened residual of what the pose puts behind the camera
 _MIN_DEPTH_RATIO = 0.02  # of the depth in the other camera: nearer counts as behind it
@@ -81,12 +81,16 @@ class ImageView:
         half = np.asarray(cv2.pyrDown(self.pixels), np.uint8)
         return self.pixels, half, np.asarray(cv2.pyrDown(half), np.uint8)
 
+    def kernels(self, level: int) -> F32:
+        """Kernels (N, 3, S) of the features' patches, from this image of `pyramid`."""
+        if level not in self._kernels:
+            px = self.px / np.float32(2**level)
+            self._kernels[level] = patches.extract_kernels(self.pyramid[level], px)
+        return self._kernels[level]
+
     @cached_property
-    def patches(self) -> tuple[patches.Patches, ...]:
-        """Patches of the features, from each image of `pyramid`."""
-        return tuple(
-            patches.extract(image, self.px / np.float32(2**level)) for level, image in enumerate(self.pyramid)
-        )
+    def _kernels(self) -> dict[int, F32]:
+        return {}
 
     @cached_property
     def uv(self) -> F64:
@@ -157,8 +161,19 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
 
 def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verification | Refusal:
     """Return the pose of the query's body in the candidate's by their images, from the pose T_c_q (4, 4) that
-    the map has; or why there is none."""
-    aligned = align_images(T_c_q, query, candidate)
+    the map has; or why there is none.
+
+    Coarse images are used only where the map's pose is too far off without: they take twice the time."""
+    at_once = _align_from_map(T_c_q, query, candidate, _FINE)
+    if isinstance(at_once, Verification):
+        return at_once
+    return _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
+
+
+def _align_from_map(
+    T_c_q: F64, query: ImageView, candidate: ImageView, levels: tuple[int, ...]
+) -> Verification | Refusal:
+    aligned = align_images(T_c_q, query, candidate, levels)
     if aligned is None:
         return Refusal("too few patches align from the map's pose")
     if aligned.found < _MIN_FOUND_SHARE * aligned.predicted:
@@ -184,13 +199,15 @@ class _Alignment(NamedTuple):
     predicted: int
 
 
-def align_images(T_c_q: F64, query: ImageView, candidate: ImageView) -> AlignedLoop | None:
-    """Refine the pose T_c_q (4, 4) of the query's body in the candidate's by aligning their patches; None
-    where too few can be aligned."""
+def align_images(
+    T_c_q: F64, query: ImageView, candidate: ImageView, levels: tuple[int, ...] = _COARSE_TO_FINE
+) -> AlignedLoop | None:
+    """Refine the pose T_c_q (4, 4) of the query's body in the candidate's by aligning their patches, at each
+    of these levels in turn; None where too few can be aligned."""
     if not query.pyramid or not candidate.pyramid:
         return None
     T = se3.inverse(candidate.T_body_cam0) @ T_c_q @ query.T_body_cam0
-    for level in _LEVELS:
+    for level in levels:
         forward = _align(T, query, candidate, level)
         backward = _align(se3.inverse(T), candidate, query, level)
         found = len(forward.feature) + len(backward.feature)
@@ -242,7 +259,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
     if len(index) == 0:
         return _Alignment(index, np.zeros((0, 2)), 0)
     size = 2.0**level
-    kernels = source.patches[level].kernels[index]
+    kernels = source.kernels(level)[index]
     images = (target.pyramid[level],)
     aligned = patches.align(images, len(index), kernels, px[index] / size, warp[index], _MAX_STEPS)
     distance_px = np.hypot(*(aligned.px - px[index] / size).T)

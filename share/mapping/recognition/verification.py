@@ -1,7 +1,8 @@
 """Verification of a candidate: the relative pose of two views, or the reason why there is none.
 
-Descriptors have to match, either view's 3D points have to give a pose in the other's image (PnP), both poses
-have to agree, and the result must not contradict gravity. A refusal says which check failed and by how much.
+Descriptors have to match, some of them closely; either view's 3D points have to give a pose in the other's
+image (PnP), both poses have to agree, and the result must not contradict gravity. A refusal says which check
+failed and by how much.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from share.geometry.camera import rays
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
 from share.mapping.recognition.refinement import KeypointNoise, refine_pose, transfer_keypoints
 from share.types import F64, View
-from share.vision.matching import DescriptorPairs, hamming_matrix, mutual_best, pairs_within
+from share.vision.matching import DescriptorPairs, close_pairs, hamming_matrix, mutual_best, pairs_within
 
 _MIN_DEPTH_M, _MAX_DEPTH_M = 0.05, 1000.0  # other depths count as unknown
 
 
+CLOSE_BITS = 40  # largest Hamming distance of a close match
+MIN_CLOSE_MATCHES = 12  # all verified pairs had more, every second other candidate fewer
 MAX_BITS = 64  # largest Hamming distance of a match, of 256
 MIN_MATCHES = 20  # mutual nearest neighbours required before geometry is tried
 RANSAC_PX = 6.0  # reprojection error of a RANSAC inlier
@@ -135,6 +138,8 @@ class _PoseFit:
 
 
 def _verify_or_raise(query: CameraView, candidate: CameraView, seed: int) -> Verification:
+    close = close_pairs(query.view.descriptors, candidate.view.descriptors, CLOSE_BITS)
+    _require_count(len(mutual_best(close).rows), MIN_CLOSE_MATCHES, "close matches")
     y_q, y_c = query.keypoints, candidate.keypoints
     candidate_pairs = pairs_within(
         hamming_matrix(query.view.descriptors, candidate.view.descriptors), GUIDED_BITS

@@ -1,0 +1,87 @@
+"""How the candidates of a query are checked: by their looks, from the pose that the map has, or not at all.
+
+Within a map most of what looks alike is out of view, and what is in view can be aligned from the map's pose,
+which costs a third of a verification and succeeds more often. The map may be wrong, so now and then a
+keyframe's candidates are verified whatever the map says.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from typing import NamedTuple
+
+import numpy as np
+
+from share.geometry import se3
+from share.mapping.map_graph import MapGraph
+from share.types import F64
+
+# Views further apart than either seldom share enough points.
+_FAR_M = 4.0
+_FAR_RAD = 1.0
+_SURE_SIGMAS = 3.0  # by which they are further apart
+# Images align from a pose of the map that is known at least so well. The covariances are upper bounds: the
+# poses are about three times as good.
+_ALIGN_SIGMA_M = 0.1
+_ALIGN_SIGMA_RAD = float(np.radians(1.0))
+
+
+class CandidateChecks(NamedTuple):
+    """Candidates of one query, best first. by_map: to be aligned; by_looks: to be verified."""
+
+    by_map: list[int]
+    by_looks: list[int]
+
+
+def choose_checks(
+    graph: MapGraph,
+    node_id: int,
+    candidates: Sequence[int],
+    with_image: AbstractSet[int],
+    is_aligned: bool,
+    is_recheck: bool,
+) -> CandidateChecks:
+    """Choose how to check each candidate of a keyframe.
+
+    is_aligned: the keyframe was aligned with others near it, so the map is right around it, and those near it
+    are left out. is_recheck: verify what is out of view by the map too, and all others that are not aligned.
+    """
+    own = [n for n in candidates if graph.is_same_map(node_id, n)]
+    out_of_view, alignable = _by_map_poses(graph, node_id, own)
+    left_out = set(own) - out_of_view if is_aligned else set[int]()
+    if is_recheck:
+        return CandidateChecks([], [n for n in candidates if n not in left_out])
+    left_out |= out_of_view
+    by_map = [n for n in own if n in alignable - left_out and {n, node_id} <= with_image]
+    return CandidateChecks(by_map, [n for n in candidates if n not in left_out and n not in by_map])
+
+
+def _by_map_poses(graph: MapGraph, node_id: int, own: Sequence[int]) -> tuple[set[int], set[int]]:
+    """Return which keyframes of the map are surely out of view, and which others have a pose that is known
+    well enough to align."""
+    out_of_view, alignable = set[int](), set[int]()
+    if not own:
+        return out_of_view, alignable
+    for other, pose in zip(own, graph.relative_estimates(node_id, own), strict=True):
+        sigma_m, sigma_rad = se3.position_sigma(pose.cov), _rotation_sigma(pose.cov)
+        distance_m, angle_rad = float(np.linalg.norm(pose.T[:3, 3])), float(se3.rotation_angle(pose.T))
+        if distance_m - _SURE_SIGMAS * sigma_m > _FAR_M or angle_rad - _SURE_SIGMAS * sigma_rad > _FAR_RAD:
+            out_of_view.add(other)
+        elif sigma_m <= _ALIGN_SIGMA_M and sigma_rad <= _ALIGN_SIGMA_RAD:
+            alignable.add(other)
+    return out_of_view, alignable
+
+
+def _rotation_sigma(cov: F64) -> float:
+    return float(np.sqrt(np.trace(cov[:3, :3])))
+
+
+def larger_maps_first(graph: MapGraph, others: Sequence[int]) -> list[int]:
+    """Sort candidates: those in larger maps first, so that agents end up in one map."""
+    nodes = graph.odometry.nodes
+    sizes: Counter[int] = Counter()
+    for segment, reference_segment in zip(graph.odometry.segments, graph.reference_segments, strict=True):
+        sizes[reference_segment] += len(segment.nodes)
+    return sorted(others, key=lambda n: -sizes[graph.reference_segments[nodes[n].segment]])
