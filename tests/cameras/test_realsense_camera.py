@@ -15,9 +15,8 @@ from helpers.software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 from share.cameras.realsense import camera as adapter
 from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import AttachedDevice, choose_device
-from share.cameras.realsense.sdk_data import read_camera as factory_camera
-from share.cameras.realsense.sdk_data import read_extrinsics, scale_depth
-from share.cameras.realsense.streams import StreamRequest
+from share.cameras.realsense.streams import StreamRequest, read_extrinsics, scale_depth
+from share.cameras.realsense.streams import read_camera as factory_camera
 from share.errors import ShareError, UsageError
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.ros_messages import encode_raw
