@@ -19,7 +19,7 @@ from helpers.recordings import make_euroc, make_tum
 from helpers.ssh_server import HOST, ssh_server
 
 from share import __version__
-from share.cli.main import COMMANDS
+from share.cli.commands import COMMANDS
 
 MB = 1_000_000
 
@@ -54,13 +54,13 @@ def test_version_and_help_at_once(share):
         began = time.monotonic()
         listed = share("--help").stdout
         took.append(time.monotonic() - began)
-    assert all(name in listed for name in COMMANDS)
+    assert all(name in listed for name in COMMANDS if " " not in name)
     assert min(took) < 0.5
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_of_the_table_is_in_it(share, name):
-    assert share(name, "--help").stdout.startswith(f"Usage: share {name}")
+    assert share(*name.split(), "--help").stdout.startswith(f"Usage: share {name}")
 
 
 def test_recordings_of_all_kinds_are_read_and_written(share, tmp_path):
