@@ -54,7 +54,7 @@ def codes(text: str) -> list[str]:
 
 
 def first_cells(text: str) -> list[str]:
-    """Of the rows of all tables."""
+    """Return the first cell of each row of all tables."""
     return re.findall(r"^\| *([^|]*`[^|]*)\|", text, re.MULTILINE)
 
 

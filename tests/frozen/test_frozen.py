@@ -70,8 +70,8 @@ def test_recordings_of_all_kinds_are_read_and_written(share, tmp_path):
     share("dataset", "recover", mcap, "--out", tmp_path / "again.mcap")
     sources = {euroc: 6, mcap: 6, tmp_path / "back": 6, tmp_path / "again.mcap": 6, tum: 5}
     for source, frames in sources.items():
-        told = json.loads(share("dataset", "info", source, "--json").stdout)
-        assert told["streams"]["cam0"]["count"] == frames
+        reported = json.loads(share("dataset", "info", source, "--json").stdout)
+        assert reported["streams"]["cam0"]["count"] == frames
 
 
 def test_wrong_use_is_one_line(share):
@@ -203,5 +203,5 @@ def test_it_is_put_onto_a_device(program, tmp_path):
         done = device.deploy(*command, host=HOST, ssh=ssh, dist=program.parent)
     assert done.code == 0, done.err
     there = device.root / "opt" / "share" / "current" / "share"
-    told = subprocess.run([there, "--version"], env={}, capture_output=True, text=True, check=True).stdout
-    assert told.split()[-1] == __version__ == (program.parent / "VERSION").read_text().strip()
+    reported = subprocess.run([there, "--version"], env={}, capture_output=True, text=True, check=True).stdout
+    assert reported.split()[-1] == __version__ == (program.parent / "VERSION").read_text().strip()

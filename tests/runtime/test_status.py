@@ -87,7 +87,7 @@ def metrics(body):
 
 
 def real_report():
-    """Of an edge that knows one agent and nothing more."""
+    """Return the report of an edge that knows one agent and nothing more."""
     edge, mapper = Edge(Config(), session=5), Mapper(Config())
     hello = hello_of("ann", 1)
     for effect in edge.handle(PeerMessageReceived(peer_id(1), encode(hello)), 10**9):
@@ -230,12 +230,12 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_the_page_shows_the_consistency_of_agents():
     """Each field that the page reads is one of the report's."""
-    told = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
-    with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": told}}}) as server:
-        assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == told
+    reported = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
+    with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": reported}}}) as server:
+        assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == reported
         page = get(server, "/")[2].decode()
     assert 'id="consistency"' in page and '["set apart", "disputed"].includes' in page
-    assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= told.keys()
+    assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= reported.keys()
     assert {"reason", "log_scale", "sigma", "put_right"} <= set(re.findall(r"\bc\.(\w+)", page))
 
 
@@ -243,18 +243,18 @@ def test_the_page_shows_the_consistency_of_agents():
 
 
 def test_a_failed_report_is_500_and_reported_once():
-    told = []
+    reported = []
 
     def report():
         raise RuntimeError("the map\nis gone")
 
-    with serving(report, tell=told.append) as server:
+    with serving(report, tell=reported.append) as server:
         answers = [get(server, path) for path in ("/health", "/metrics", "/snapshot.json", "/health")]
         assert get(server, "/")[0] == 200
     assert {(status, body) for status, _, body in answers} == {
         (500, b"no report: RuntimeError: the map is gone\n")
     }
-    assert told == ["status: no report: RuntimeError: the map is gone"]
+    assert reported == ["status: no report: RuntimeError: the map is gone"]
 
 
 def test_a_report_that_is_no_json_is_500():

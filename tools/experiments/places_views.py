@@ -101,7 +101,7 @@ LOOSE_LIMITS = {"MIN_INLIERS": 8, "MIN_DIRECTION_INLIERS": 4, "MAX_SIGMA_DEG": 3
 
 
 class Tried(NamedTuple):
-    """Of every pair, (M,): true match; accepted by loose limits; pose right, or right for the twin; inliers;
+    """Every pair, (M,): true match; accepted by loose limits; pose right, or right for the twin; inliers;
     sigma [deg]; number of pairs that it stands for."""
 
     true: F64
