@@ -58,9 +58,11 @@ $(LOCKS)/%.txt:
 	@echo "make: there is no $@; there are $(wildcard $(LOCKS)/*.txt): use one of those machines and Pythons, or add this one to LOCKED in the Makefile and run make lock" >&2; exit 1
 
 LOCKED := x86_64-py3.11 x86_64-py3.12 aarch64-py3.12
+# What setup.cfg asks for, as a list: uv would have to build SHARE to read it, which --only-binary forbids.
+ASKED := $(PYTHON) -c "import configparser; c = configparser.ConfigParser(); c.read('setup.cfg'); e = c['options.extras_require']; print(c['options']['install_requires'], e['freeze'], e['realsense'])"
 lock: install
 	$(PIP) -e '.[release]'
-	@for one in $(LOCKED); do echo "$(LOCKS)/$$one.txt"; $(BIN)/uv pip compile --quiet --upgrade setup.cfg --extra freeze --extra realsense \
+	@for one in $(LOCKED); do echo "$(LOCKS)/$$one.txt"; $(ASKED) | $(BIN)/uv pip compile --quiet --upgrade - \
 	    --python-version $${one#*-py} --python-platform $${one%-py*}-manylinux_2_28 --only-binary :all: --generate-hashes \
 	    --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" -o $(LOCKS)/$$one.txt || exit 1; done
 sbom: install $(FREEZE)/installed

@@ -31,8 +31,7 @@ from share.runtime import edge, mapper_process
 from share.runtime.edge import EdgeRun
 from share.runtime.frame_consumers import RemoteTracking
 from share.runtime.offline_tracking import track
-from share.runtime.status_metrics import METRICS, render_metrics
-from share.runtime.status_server import StatusServer
+from share.runtime.status_server import METRICS, StatusServer, render_metrics
 from share.runtime.worker_process import END, Inbox
 from share.types import TrackState
 from share.wire.codec import encode
@@ -55,7 +54,7 @@ def codes(text: str) -> list[str]:
 
 
 def first_cells(text: str) -> list[str]:
-    """Of the rows of all tables."""
+    """Return the first cell of each row of all tables."""
     return re.findall(r"^\| *([^|]*`[^|]*)\|", text, re.MULTILINE)
 
 

@@ -126,7 +126,7 @@ def trace(session: Path) -> dict[str, int]:
 
 
 def medians(what: str, entered: list[set[tuple[str, str]]]) -> dict[str, int]:
-    """Of packages, modules and functions."""
+    """Return the median number of packages, modules and functions that a frame or keyframe entered."""
     kinds: dict[str, Callable[[tuple[str, str]], object]] = {
         "packages": lambda call: call[0].rpartition("/")[0],
         "modules": lambda call: call[0],
@@ -139,7 +139,7 @@ def medians(what: str, entered: list[set[tuple[str, str]]]) -> dict[str, int]:
 
 
 def trace_frames(session: Path) -> list[set[tuple[str, str]]]:
-    """Of each frame of the first agent, once it has a pose."""
+    """Return what each frame of the first agent enters, once it has a pose."""
     from share.config import Config
     from share.recordings.session import read_session
     from share.runtime.pipeline import make_tracker, read_frames
@@ -158,7 +158,7 @@ def trace_frames(session: Path) -> list[set[tuple[str, str]]]:
 
 
 def trace_keyframes(session: Path) -> list[set[tuple[str, str]]]:
-    """Of each keyframe: all steps of the mapper until the next one comes."""
+    """Return what each keyframe enters: all steps of the mapper until the next one comes."""
     from share.lab.evaluate.real_time import RunOptions
     from share.lab.evaluate.virtual_time import play_in_virtual_time
     from share.mapping.mapper import Mapper

@@ -7,14 +7,11 @@ from pathlib import Path
 import click
 
 from share.cli import camera_options, options
-from share.cli.calibrate_camera import camera
-from share.cli.calibrate_camera_imu import camera_imu
-from share.cli.calibrate_imu import imu
-from share.cli.calibrate_mocap import mocap
+from share.cli.commands import CommandGroup
 from share.errors import UsageError
 
 
-@click.group()
+@click.group(cls=CommandGroup, prefix="calibrate ")
 def calibrate() -> None:
     """Calibrate a device's cameras and IMU, and how they and a motion capture's body are mounted.
 
@@ -23,48 +20,6 @@ def calibrate() -> None:
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
     """
-
-
-for command in (camera, camera_imu, imu, mocap):
-    calibrate.add_command(command)
-
-
-@calibrate.command(short_help="Write the factory calibration of an attached RealSense.")
-@click.argument("serial", required=False)
-@camera_options.profile
-@camera_options.mode
-@click.option("--depth", is_flag=True, help="Include the depth stream.")
-@options.out_folder
-def realsense(serial: str | None, profile_name: str | None, mode: str | None, depth: bool, out: Path) -> None:
-    """Write the factory calibration stored in a RealSense camera, for use with --calib.
-
-    SERIAL selects the camera if several are attached. The factory does not measure IMU noise: the profile's
-    is written. Existing files are not overwritten.
-
-    \b
-    Example:  share calibrate realsense --out calib/mine
-    """
-    from share.cameras.realsense.camera import RealSenseCamera
-    from share.cameras.realsense.streams import StreamRequest
-    from share.files.writing import atomic_write, writable_dir
-    from share.recordings.calibration import CAMCHAIN, IMU_CHAIN, kalibr_texts
-    from share.sensors.profile import load_profile
-
-    for path in (out / CAMCHAIN, out / IMU_CHAIN):
-        if path.exists():
-            raise UsageError(f"{path} exists and is not overwritten; give another --out")
-    request = StreamRequest(load_profile(profile_name or camera_options.PROFILE, mode), depth=depth)
-    with RealSenseCamera(request, serial) as camera:
-        rig, serial_found = camera.rig, camera.serial
-    provenance = f"factory calibration of {serial_found}"
-    writable_dir(out)
-    for name, text in kalibr_texts(
-        rig, f"{provenance}; IMU noise of profile {request.profile.name}", serial_found
-    ).items():
-        atomic_write(out / name, text)
-    size = f"{rig.cam0.width}x{rig.cam0.height}, f {rig.cam0.fx:.1f} {rig.cam0.fy:.1f} px"
-    click.echo(f"{out}: {provenance}: {size}, baseline {100 * rig.baseline:.2f} cm")
-    click.echo("IMU noise: from the profile; measure it with `share calibrate imu`")
 
 
 @calibrate.command(short_help="Write a calibration board to print, and its YAML file.")
@@ -142,3 +97,41 @@ def target(
         f"{describe_sheet(target_sheet)}, on {paper} ({target_sheet.width:g} x {target_sheet.height:g} mm)"
     )
     click.echo(f"to print: {out}   for --target: {yaml_file}")
+
+
+@calibrate.command(short_help="Write the factory calibration of an attached RealSense.")
+@click.argument("serial", required=False)
+@camera_options.profile
+@camera_options.mode
+@click.option("--depth", is_flag=True, help="Include the depth stream.")
+@options.out_folder
+def realsense(serial: str | None, profile_name: str | None, mode: str | None, depth: bool, out: Path) -> None:
+    """Write the factory calibration stored in a RealSense camera, for use with --calib.
+
+    SERIAL selects the camera if several are attached. The factory does not measure IMU noise: the profile's
+    is written. Existing files are not overwritten.
+
+    \b
+    Example:  share calibrate realsense --out calib/mine
+    """
+    from share.cameras.realsense.camera import RealSenseCamera
+    from share.cameras.realsense.streams import StreamRequest
+    from share.files.writing import atomic_write, writable_dir
+    from share.recordings.calibration import CAMCHAIN, IMU_CHAIN, kalibr_texts
+    from share.sensors.profile import load_profile
+
+    for path in (out / CAMCHAIN, out / IMU_CHAIN):
+        if path.exists():
+            raise UsageError(f"{path} exists and is not overwritten; give another --out")
+    request = StreamRequest(load_profile(profile_name or camera_options.PROFILE, mode), depth=depth)
+    with RealSenseCamera(request, serial) as camera:
+        rig, serial_found = camera.rig, camera.serial
+    provenance = f"factory calibration of {serial_found}"
+    writable_dir(out)
+    for name, text in kalibr_texts(
+        rig, f"{provenance}; IMU noise of profile {request.profile.name}", serial_found
+    ).items():
+        atomic_write(out / name, text)
+    size = f"{rig.cam0.width}x{rig.cam0.height}, f {rig.cam0.fx:.1f} {rig.cam0.fy:.1f} px"
+    click.echo(f"{out}: {provenance}: {size}, baseline {100 * rig.baseline:.2f} cm")
+    click.echo("IMU noise: from the profile; measure it with `share calibrate imu`")

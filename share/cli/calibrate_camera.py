@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from share.lab.calibrate.target import Target
 
 
-@click.command(short_help="Calibrate one or two cameras from views of a board.")
+@click.command()
 @click.argument("source")
 @options.target
 @click.option(

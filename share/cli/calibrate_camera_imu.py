@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _WARN_NOISE_RATIO = 2.0  # residuals above this many times the stated noise give a warning
 
 
-@click.command("camera-imu", short_help="Calibrate camera-IMU extrinsics and time offset.")
+@click.command("camera-imu")
 @click.argument("source")
 @options.target
 @click.option(

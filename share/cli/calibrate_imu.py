@@ -18,7 +18,7 @@ _WARN_RATIO = 2.0  # a figure beyond this factor of the profile's, up or down, g
 _SYMBOLS = {"density": "N", "instability": "B", "walk": "K"}
 
 
-@click.command(short_help="Estimate IMU noise and bias from a recording at rest.")
+@click.command()
 @click.argument("source")
 @click.option(
     "--profile",

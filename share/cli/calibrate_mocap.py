@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from share.lab.mocap.trajectory import MocapTrajectory
 
 
-@click.command(short_help="Calibrate a motion capture's body and clock to a device.")
+@click.command()
 @click.argument("source")
 @click.option(
     "--truth",

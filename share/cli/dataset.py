@@ -9,21 +9,18 @@ from typing import Any
 import click
 
 from share.cli import options
-from share.cli.dataset_align import align
+from share.cli.commands import CommandGroup
 from share.cli.terminal import print_note, progress
 from share.errors import UsageError
 
 
-@click.group()
+@click.group(cls=CommandGroup, prefix="dataset ")
 def dataset() -> None:
     """Inspect, convert, recover and align recordings; inspect and export maps.
 
     \b
     Example:  share dataset info rec/kitchen
     """
-
-
-dataset.add_command(align)
 
 
 @dataset.command(short_help="Describe a recording or a map.")

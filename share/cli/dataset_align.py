@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from share.lab.mocap.trajectory import MocapTrajectory
 
 
-@click.command(short_help="Make a session of field recordings and a motion capture.")
+@click.command()
 @click.argument("recordings", nargs=-1, required=True, metavar="NAME=RECORDING...")
 @click.option(
     "--mocap",

@@ -63,6 +63,7 @@ def demo(
         raise UsageError(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
         )
+    from share.devices.host import core_count
     from share.files.writing import writable_dir
     from share.lab.emulate.recipe import DEMO_AGENTS, demo_recipe, meeting_seed
     from share.lab.emulate.session import make_cached_session
@@ -70,7 +71,6 @@ def demo(
     from share.lab.evaluate.real_time import RunOptions, play_in_real_time
     from share.lab.evaluate.scoring import score_session
     from share.recordings.session import read_session
-    from share.runtime.machine import core_count
 
     LinkAssignment.parse(link).check(DEMO_AGENTS)
     writable_dir(out)

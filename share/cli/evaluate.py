@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.evaluate_compare import compare
-from share.cli.evaluate_many import ablation, sweep
+from share.cli.commands import CommandGroup
 from share.cli.terminal import Column, LiveLine, column_table
 
 if TYPE_CHECKING:
     from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
 
 
-@click.group()
+@click.group(cls=CommandGroup, prefix="evaluate ")
 def evaluate() -> None:
     """Play sessions, score them, and compare policies, settings and trackers.
 
@@ -30,10 +29,6 @@ def evaluate() -> None:
               share evaluate score runs/one
               share evaluate ablation room1 --link wifi5 --out ablation
     """
-
-
-for command in (ablation, sweep, compare):
-    evaluate.add_command(command)
 
 
 @evaluate.command(short_help="Play a session and keep all outputs.")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from share.runtime.source import Source
 
 
-@click.command(short_help="Compare SHARE's tracker with others.")
+@click.command()
 @click.argument("sources", nargs=-1, required=True)
 @click.option(
     "--peer",

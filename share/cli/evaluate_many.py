@@ -69,7 +69,7 @@ def check_none_failed(succeeded: int, total: int) -> None:
         )
 
 
-@click.command(short_help="Compare policies on sessions.")
+@click.command()
 @click.argument("sessions", nargs=-1, required=True, type=options.PATH)
 @click.option(
     "--policy",
@@ -163,7 +163,7 @@ def _write_ablation_report(
 _HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges per metre", "AR QoE")
 
 
-@click.command(short_help="Compare settings on sessions.")
+@click.command()
 @click.argument("sessions", nargs=-1, required=True, type=options.PATH)
 @click.option(
     "--set",

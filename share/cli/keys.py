@@ -9,9 +9,10 @@ from typing import Any
 import click
 
 from share.cli import options
+from share.cli.commands import CommandGroup
 
 
-@click.group()
+@click.group(cls=CommandGroup, prefix="keys ")
 def keys() -> None:
     """Generate keys, and authorize the agents that may connect to an edge.
 

@@ -1,4 +1,4 @@
-"""The command line `share`. A command's module is imported when it is called, so that `--help` is quick."""
+"""The command line `share`: it runs a command and turns every error into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -7,71 +7,20 @@ from share import startup
 startup.prepare_process()  # before anything below can import numpy
 
 import contextlib  # noqa: E402
-import difflib  # noqa: E402
-import importlib  # noqa: E402
 import sys  # noqa: E402
 from typing import Any  # noqa: E402
 
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
+from share.cli.commands import CommandGroup  # noqa: E402
 from share.cli.stderr import flush_all  # noqa: E402
-from share.errors import ShareError, UsageError, one_line  # noqa: E402
+from share.errors import ShareError, one_line  # noqa: E402
 from share.runtime.signals import unwind_on_signal  # noqa: E402
 
-# name: (module, attribute, one line of help). A literal table, so that a freezer sees every module.
-COMMANDS = {
-    "demo": ("share.cli.demo", "demo", "Try the whole system on this machine; nothing else is needed."),
-    "capture": ("share.cli.capture", "capture", "Record the camera and IMU of a headset or robot."),
-    "track": ("share.cli.track", "track", "Track one agent over a recording or camera, without an edge."),
-    "agent": ("share.cli.agent", "agent", "Run one agent: track at sensor rate, send keyframes to an edge."),
-    "edge": ("share.cli.edge", "edge", "Run the server: merge all agents' maps, send corrections."),
-    "dataset": (
-        "share.cli.dataset",
-        "dataset",
-        "Inspect, convert, recover and align recordings; export maps.",
-    ),
-    "sync": ("share.cli.sync", "sync", "Give all machines of a room one clock, and check it."),
-    "doctor": ("share.cli.doctor", "doctor", "Check this device, and say how to fix what is missing."),
-    "emulate": (
-        "share.cli.emulate",
-        "emulate",
-        "Make recordings of agents that move through a virtual room.",
-    ),
-    "evaluate": (
-        "share.cli.evaluate",
-        "evaluate",
-        "Play sessions, score them, compare policies and trackers.",
-    ),
-    "train": ("share.cli.train", "train", "Train the model that estimates the tracking error."),
-    "calibrate": (
-        "share.cli.calibrate",
-        "calibrate",
-        "Calibrate a device's cameras, IMU and motion-capture body.",
-    ),
-    "keys": ("share.cli.keys", "keys", "Manage the keys with which other machines connect to an edge."),
-}
 
-
-class _LazyGroup(click.Group):
-    """A click group that imports a command's module when that command is called."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        module, attribute, _ = COMMANDS[cmd_name]
-        command: click.Command = getattr(importlib.import_module(module), attribute)
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in COMMANDS and not args[0].startswith("-"):
-            raise UsageError(f"no command '{args[0]}'; {_suggestion(args[0])} (see `share --help`)")
-        return super().resolve_command(ctx, args)
+class _RootGroup(CommandGroup):
+    """`share` itself: a signal ends every command alike."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -80,13 +29,10 @@ class _LazyGroup(click.Group):
         except KeyboardInterrupt:  # click would print an empty line first
             raise _InterruptedError("interrupted") from None
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, _, text) in COMMANDS.items()])
-
 
 @click.group(
-    cls=_LazyGroup,
+    cls=_RootGroup,
+    prefix="",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
 )
 @click.version_option(__version__, prog_name="share")
@@ -109,11 +55,6 @@ class _InterruptedError(ShareError):
     exit_code = 130
 
 
-def _suggestion(name: str) -> str:
-    near = difflib.get_close_matches(name, COMMANDS, n=1)
-    return f"did you mean '{near[0]}'?" if near else f"commands: {', '.join(COMMANDS)}"
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Run a command; turn every error into one line on stderr and an exit code, here and nowhere else.
 
@@ -131,10 +72,6 @@ def main(arguments: list[str] | None = None) -> None:
         context = getattr(error, "ctx", None)
         hint = f" (see `{context.command_path} --help`)" if context else ""
         message = error.format_message().replace("\n", " ")
-        if context and isinstance(context.command, click.Group) and message.startswith("No such command"):
-            message += (
-                "" if "Did you mean" in message else f" Commands: {', '.join(context.command.commands)}."
-            )
         _exit_with(message + hint, error.exit_code)
     except (KeyboardInterrupt, click.Abort):
         _exit_with("interrupted", 130)

@@ -54,7 +54,7 @@ target = click.option(
 
 
 def _cores() -> int:
-    from share.runtime.machine import core_count
+    from share.devices.host import core_count
 
     return core_count()
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
+from share.cli.commands import CommandGroup
 from share.cli.terminal import Column, LiveLine, column_table, progress
 from share.errors import ShareError, UsageError
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 PORT = 11123  # NTP's own, 123, needs root
 
 
-@click.group()
+@click.group(cls=CommandGroup, prefix="sync ")
 def sync() -> None:
     """Give all machines of a room without internet one clock, and check how well they agree.
 

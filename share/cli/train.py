@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
+from share.cli.commands import CommandGroup
 from share.cli.terminal import LiveLine
 from share.errors import UsageError, install_hint
 
@@ -22,7 +23,7 @@ _BASE_OPTION = click.option(
 )
 
 
-@click.group()
+@click.group(cls=CommandGroup, prefix="train ")
 def train() -> None:
     """Train the error model, which estimates the tracking error of a keyframe.
 

@@ -26,11 +26,25 @@ _MAX_GYRO_BIAS, _MAX_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
 MAX_SENSOR_DISTANCE_M = 1e3  # of sensors on one body, also if given in millimetres, which `rig_check` reports
 _RIGID = 1e-6  # a transform nearer to rigid than this is not changed
 _MAX_DISTORTION = 1e4  # of a coefficient; k3 of a narrow lens is some hundreds
+_MIN_DEPTH_RATIO = 0.02  # of a point to its depth in the first camera; below it counts as behind the camera
 
 
 def rays(uv: F64) -> F64:
     """Return points (N, 3) at depth 1 on the rays through normalised coordinates (N, 2)."""
     return np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+
+
+def project(q: F64) -> tuple[F64, F64]:
+    """Project points given as q (N, 3) = R ray + rho t, of a ray with z = 1 at inverse depth rho.
+
+    Return (x, y) / z (N, 2) and its derivative by q (N, 2, 3); NaN for points behind the camera.
+    """
+    z = np.where(q[:, 2] > _MIN_DEPTH_RATIO, q[:, 2], np.nan)
+    uv = q[:, :2] / z[:, None]
+    D = np.zeros((len(q), 2, 3))
+    D[:, 0, 0] = D[:, 1, 1] = 1 / z
+    D[:, :, 2] = -uv / z[:, None]
+    return uv, D
 
 
 def _alternatives(counts: tuple[int, ...]) -> str:

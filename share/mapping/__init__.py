@@ -4,7 +4,8 @@ Begin with `mapper.Mapper`: `mapper.Mapper._look_up` is a keyframe's way, `mappe
 map that has changed:
 
     query_queue          which keyframe is looked up next
-    recognition          candidates (`recognition.index`), and the pose of each (`recognition.verification`)
+    recognition          align the images of keyframes nearby (`recognition.patch_alignment`); find others
+                         (`recognition.index`), verify (`recognition.verification`) and align them
     agents               do the agents agree on scale and covariances? else quarantine
     loop_acceptance      is a loop accepted: alone, or with others (`loop_consistency`, `overlap_check`)
     map_graph            nodes, edges, and which segments (`segments`) form one map
@@ -18,6 +19,7 @@ To change:
 
     the descriptor       `share.vision.orb`, `share.vision.matching`; `recognition.index` hashes its bits
     the verification     `recognition.verification`; `MIN_INLIERS`
+    the loop's pose      `recognition.patch_alignment`, also its covariance
     accepting loops      `loop_acceptance`; `merge.join_places`
     the solver           `graph.optimiser` (Levenberg-Marquardt, robust kernel), `graph.solver` (incremental)
     the merge gate       `share.scheduling.merge_gate`

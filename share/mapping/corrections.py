@@ -1,5 +1,5 @@
-"""What the mapper tells of its agents: events with the corrections that follow. An agent is sent those that
-matter, and told once of one that is held back.
+"""Events of the mapper's agents, with the corrections that follow. An agent is sent those that matter, and
+gets one notice of one that is held back.
 """
 
 from __future__ import annotations

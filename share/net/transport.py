@@ -82,7 +82,7 @@ class EdgeLink(Protocol):
         ...
 
     def refusals(self) -> list[str]:
-        """Return a line for each refusal since the last call: who and what to do; equal for equal causes."""
+        """Return a line for each refusal since the last call: peer and remedy; equal for equal causes."""
         ...
 
     def trouble(self) -> str | None:

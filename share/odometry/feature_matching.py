@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from share.array_table import ArrayTable
 from share.geometry import se3
-from share.geometry.camera import Camera, Rig, rays
+from share.geometry.camera import Camera, Rig, project, rays
 from share.odometry.feature_appearance import Appearance, is_stereo_due
 from share.odometry.state import FilterState
 from share.types import F32, F64, I64, U8, Frame
@@ -215,8 +215,6 @@ def _store(
 # A feature at inverse depth rho on the ray f of its anchor is q = f + rho p in the homogeneous coordinates of
 # any frame: nothing here divides by rho, so a feature may be infinitely far away (Civera et al. 2008).
 
-_MIN_DEPTH = 0.02  # homogeneous depth; below it a point counts as behind the camera
-
 
 @dataclass(frozen=True, eq=False)
 class Prediction(ArrayTable):
@@ -307,16 +305,16 @@ def _project_with_jacobians(
     Return uv (N, 2), d uv / d q (N, 2, 3) and d uv / d inverse depth (N, 2).
     """
     if T_cam1_cam0 is None:
-        uv, D = _project(q)
+        uv, D = project(q)
         return uv, D, (D @ q_by_rho[:, :, None])[:, :, 0]
     R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
     if in_cam1 is None:
-        uv, D = _project(q @ R.T + rho[:, None] * t)
+        uv, D = project(q @ R.T + rho[:, None] * t)
         D_q = D @ R
         return uv, D_q, (D_q @ q_by_rho[:, :, None])[:, :, 0] + D @ t
     q_cam = q.copy()
     q_cam[in_cam1] = q[in_cam1] @ R.T + rho[in_cam1, None] * t
-    uv, D = _project(q_cam)
+    uv, D = project(q_cam)
     shift_term = D[in_cam1] @ t
     D[in_cam1] = D[in_cam1] @ R
     J_rho = (D @ q_by_rho[:, :, None])[:, :, 0]
@@ -330,7 +328,7 @@ def is_in_view(
     """Return which points (N,) on rays (N, 2) of keyframe `keyframe_index`, at inverse depths (N,), are in
     cam0's view."""
     T = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses[keyframe_index] @ state.T_body_cam
-    uv, _ = _project(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
+    uv, _ = project(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
     return np.asarray(camera.is_inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)
 
 
@@ -339,13 +337,3 @@ def anchors_in_camera(state: FilterState, indices: I64 | slice = slice(None)) ->
     T_cam_anchor = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
     out: F64 = T_cam_anchor[state.anchor[indices]]
     return out
-
-
-def _project(q: F64) -> tuple[F64, F64]:
-    """Return (x, y) / z of (N, 3) and the derivative (N, 2, 3); NaN behind the camera."""
-    z = np.where(q[:, 2] > _MIN_DEPTH, q[:, 2], np.nan)
-    uv = q[:, :2] / z[:, None]
-    D = np.zeros((len(q), 2, 3))
-    D[:, 0, 0] = D[:, 1, 1] = 1 / z
-    D[:, :, 2] = -uv / z[:, None]
-    return uv, D

@@ -1,4 +1,4 @@
-"""Admission at the edge: who may join, limits on new runs, and the registry of known runs."""
+"""Admission at the edge: which agents may join, limits on new runs, and the registry of known runs."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ class MapperRestarts:
 
 
 class MapperProgress:
-    """The newest report of one mapper, {} before the first, and what it tells of its progress."""
+    """The newest report of one mapper, {} before the first, and what follows from it about its progress."""
 
     def __init__(self) -> None:
         self.report: dict[str, Any] = {}

@@ -10,10 +10,9 @@ from typing import NamedTuple
 from share.cameras.realsense.devices import is_camera
 from share.errors import UsageError
 from share.recordings.calibration import Calibration, read_calibration
-from share.recordings.euroc import is_euroc, open_euroc
+from share.recordings.folders import is_euroc, is_tum, open_euroc, open_tum
 from share.recordings.recording import Source
 from share.recordings.session import is_session, read_session
-from share.recordings.tum import is_tum, open_tum
 
 __all__ = ["READERS", "Source", "open_source"]
 

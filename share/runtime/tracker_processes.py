@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from share.config import Config
+from share.devices.host import core_count, free_memory_bytes
 from share.geometry.camera import Rig
 from share.odometry.track_result import TrackResult
 from share.protocol.edge_events import (
@@ -21,7 +22,6 @@ from share.protocol.edge_events import (
 )
 from share.protocol.remote_tracking import TrackingCapacity
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
-from share.runtime.machine import core_count, free_memory_bytes
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 from share.startup import HeapTrimmer
 from share.timing import Backoff

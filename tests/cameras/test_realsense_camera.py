@@ -15,9 +15,8 @@ from helpers.software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 from share.cameras.realsense import camera as adapter
 from share.cameras.realsense.camera import RealSenseCamera
 from share.cameras.realsense.devices import AttachedDevice, choose_device
-from share.cameras.realsense.sdk_data import read_camera as factory_camera
-from share.cameras.realsense.sdk_data import read_extrinsics, scale_depth
-from share.cameras.realsense.streams import StreamRequest
+from share.cameras.realsense.streams import StreamRequest, read_extrinsics, scale_depth
+from share.cameras.realsense.streams import read_camera as factory_camera
 from share.errors import ShareError, UsageError
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.ros_messages import encode_raw
@@ -77,8 +76,8 @@ def test_images_and_motion_samples_are_unchanged(camera: SoftwareCamera) -> None
 )
 def test_depth_in_millimetres_is_recorded_as_such(unit_m: float, encoding: str) -> None:
     steps = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
-    told = float(np.float32(unit_m))  # in single precision
-    depth = scale_depth(steps, told)
+    reported = float(np.float32(unit_m))  # in single precision
+    depth = scale_depth(steps, reported)
     assert depth.dtype == np.float32
     np.testing.assert_allclose(depth, steps * unit_m, rtol=2e-7)
     message = encode_raw(ros.make_header(0, "depth"), depth)
@@ -141,8 +140,8 @@ def test_an_imu_with_other_rates_is_read_at_the_best_of_them(offered: tuple[int,
     ) as one:
         one.start(print)
         assert (one.rates_hz["accel"], one.rates_hz["gyro"], one.rates_hz["cam0"]) == (taken, 400, 30)
-    told = [f"the camera has no accel at 250 Hz; using {taken} Hz"]
-    assert said == ([] if taken == 250 else told)
+    reported = [f"the camera has no accel at 250 Hz; using {taken} Hz"]
+    assert said == ([] if taken == 250 else reported)
 
 
 def test_the_rate_of_the_gyroscope_that_is_read_is_in_the_rig() -> None:
@@ -159,9 +158,9 @@ def test_an_emitter_that_another_program_left_on_is_switched_off_and_no_longer_a
     camera: SoftwareCamera,
 ) -> None:
     for option in (rs.option.emitter_enabled, rs.option.emitter_on_off):
-        told = rs.option_range()
-        told.min, told.max, told.step, told.default = 0, 1, 1, 1
-        camera.stereo.add_option(option, told, True)
+        reported = rs.option_range()
+        reported.min, reported.max, reported.step, reported.default = 0, 1, 1, 1
+        camera.stereo.add_option(option, reported, True)
         camera.stereo.set_option(option, 1)
     read(camera, 0, lambda: None)
     assert camera.stereo.get_option(rs.option.emitter_enabled) == 0
@@ -280,12 +279,14 @@ def test_firmware_versions_are_compared_as_numbers() -> None:
 
 
 def test_a_factory_fisheye_lens_is_read() -> None:
-    """Of a T265: four coefficients, and a fifth number of 0."""
+    """A T265 has four coefficients, and a fifth number of 0."""
     models = SimpleNamespace(brown_conrady=1, kannala_brandt4=2)
-    told = SimpleNamespace(
+    reported = SimpleNamespace(
         width=848, height=800, fx=286.0, fy=286.1, ppx=420.0, ppy=400.0, model=2,
         coeffs=[-0.008, 0.045, -0.042, 0.007, 0.0],
     )  # fmt: skip
-    profile = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: told))
+    profile = SimpleNamespace(
+        as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: reported)
+    )
     camera = factory_camera(SimpleNamespace(distortion=models), profile)
     assert (camera.model, camera.distortion) == ("equidistant", (-0.008, 0.045, -0.042, 0.007))

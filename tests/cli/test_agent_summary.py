@@ -15,12 +15,12 @@ KEYS = "refused: the edge requires keys"
 UNSAFE = "could not store them in its map file; see the edge's log"
 
 
-def report(**told):
-    return {"keyframes": 60, "corrections": 3, "protocol": TOLD | told}
+def report(**reported):
+    return {"keyframes": 60, "corrections": 3, "protocol": TOLD | reported}
 
 
 @pytest.mark.parametrize(
-    ("told", "trouble", "why"),
+    ("reported", "trouble", "why"),
     [
         ({}, None, "no answer within agent.finish_s (5 s)"),
         (
@@ -33,14 +33,14 @@ def report(**told):
         ({"connected": False, "refusal": "too many"}, None, "the edge refuses 'ann': too many"),
     ],
 )
-def test_missing_acknowledgements_are_explained(told, trouble, why):
-    run = SimpleNamespace(report=report(**told), trouble=trouble)
+def test_missing_acknowledgements_are_explained(reported, trouble, why):
+    run = SimpleNamespace(report=report(**reported), trouble=trouble)
     assert unacknowledged_text(run, "ann", 5.0) == f"the edge did not acknowledge 5 keyframes: {why}"
 
 
-@pytest.mark.parametrize("told", [{"unacknowledged": 0}, {"edge_sessions": 0}])
-def test_no_explanation_if_all_is_acknowledged_or_no_edge_answered(told):
-    assert unacknowledged_text(SimpleNamespace(report=report(**told), trouble=None), "ann", 5.0) is None
+@pytest.mark.parametrize("reported", [{"unacknowledged": 0}, {"edge_sessions": 0}])
+def test_no_explanation_if_all_is_acknowledged_or_no_edge_answered(reported):
+    assert unacknowledged_text(SimpleNamespace(report=report(**reported), trouble=None), "ann", 5.0) is None
 
 
 def test_keyframe_counts_are_printed():

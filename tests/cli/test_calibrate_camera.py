@@ -69,7 +69,7 @@ def _pictures(folder: Path, rng: np.random.Generator, count: int = 14) -> None:
 def test_known_camera_is_estimated_from_a_folder_of_images(
     share: Callable[..., Done], tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    """Of the camchain that is given, all that is not found anew is kept."""
+    """All of the given camchain that is not found anew is kept."""
     _pictures(tmp_path / "pictures" / "cam0", rng)
     out, given = tmp_path / "out", tmp_path / "given.yaml"
     T_cam_imu = se3.exp(np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))

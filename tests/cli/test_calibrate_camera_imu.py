@@ -80,8 +80,8 @@ def badly_known(dance: Path, folder: Path) -> Path:
     (folder / "kalibr_imucam_chain.yaml").write_text((dance / "bare.yaml").read_text())
     parameters = dict(zip(parameter_names(CAMERA), intrinsics(CAMERA).tolist(), strict=True))
     covariance = np.diag([0.3, 0.3, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4]) ** 2
-    told = {"passed": False, "cameras": [{"parameters": parameters}], "covariance": covariance.tolist()}
-    (folder / "camera-report.json").write_text(json.dumps(told))
+    reported = {"passed": False, "cameras": [{"parameters": parameters}], "covariance": covariance.tolist()}
+    (folder / "camera-report.json").write_text(json.dumps(reported))
     return folder
 
 
@@ -107,8 +107,8 @@ def test_unreliable_result_fails_and_keeps_the_earlier_one(
     assert "camera-report.json calls these cameras unreliable" in doubted
     assert f"cameras: uncertainty of {known / 'camera-report.json'};" in done.out
     assert "position known to 2." in failed and "calibrate the cameras better first" in failed
-    told = json.loads((tmp_path / "camera-imu-report.failed.json").read_text())
-    parts = [np.array(told[f"sigmas{part}"]["rotation_rad"]) for part in ("", "_by_noise", "_by_cameras")]
+    reported = json.loads((tmp_path / "camera-imu-report.failed.json").read_text())
+    parts = [np.array(reported[f"sigmas{part}"]["rotation_rad"]) for part in ("", "_by_noise", "_by_cameras")]
     np.testing.assert_allclose(parts[0] ** 2, parts[1] ** 2 + parts[2] ** 2)
     assert "kalibr_imu_chain.yaml has other noise than was used (that of --imu" in kept
     assert "unreliable result" in failed and "gyroscope: residuals" in failed

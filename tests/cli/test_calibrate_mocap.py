@@ -101,10 +101,10 @@ def test_body_of_a_vicon_export_with_another_clock_is_estimated(share, room, tmp
     """Its clock counts frames from nought; another body is in the file."""
     mine, other = (record_mocap(Motion(seed), 14, LATE_NS, hz=RATE_HZ).T for seed in (1, 4))
     export(tmp_path / "vicon.csv", {"Hat": other, "Mine": mine}, quaternions=True)
-    told = found(room, tmp_path / "vicon.csv", "--within", "1e10", "--out", tmp_path / "out")
-    refused = share(*told)
+    reported = found(room, tmp_path / "vicon.csv", "--within", "1e10", "--out", tmp_path / "out")
+    refused = share(*reported)
     assert refused.code == 2 and "give --body BODY); it has Hat, Mine" in refused.err
-    assert share(*told, "--body", "Mine").code == 0
+    assert share(*reported, "--body", "Mine").code == 0
     turned, shifted = error_of(read_yaml(tmp_path / "out" / "mocap.yaml").pose("T_body_mocap"))
     assert turned < 0.05 and shifted < 0.0015
 
@@ -125,7 +125,7 @@ def test_recording_without_images_suffices(share, room, tmp_path):
 
 
 def test_track_of_another_motion_gives_a_warning(share, room, tmp_path):
-    """Of the same time, with the device turned a quarter about its z."""
+    """A recording of the same time, with the device turned a quarter about its z."""
     other = tmp_path / "other.tum"
     T = Motion().pose((stamps(14, 20) - START_NS) * 1e-9) @ se3.exp(np.array([0, 0, 1.57, 0, 0, 0]))
     other.write_text(format_tum(Trajectory(stamps(14, 20), T)))

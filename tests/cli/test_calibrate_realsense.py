@@ -39,8 +39,8 @@ def test_files_hold_the_factory_calibration(share: Callable[..., Done], tmp_path
 
 def test_doctor_matches_the_serial_number(share: Callable[..., Done], tmp_path: Path) -> None:
     def line(*words: object) -> tuple[str, str]:
-        told = json.loads(share("doctor", "--json", *words).out)["findings"]
-        return next((one["state"], one["what"]) for one in told if one["name"] == "serial number")
+        reported = json.loads(share("doctor", "--json", *words).out)["findings"]
+        return next((one["state"], one["what"]) for one in reported if one["name"] == "serial number")
 
     mine = tmp_path / "mine"
     share("calibrate", "realsense", "--out", mine)

@@ -70,9 +70,16 @@ def made(share, room) -> Path:
     """Aligned once."""
     out = room.folder / "room1"
     if not out.exists():
-        told = ("--body", "ann=Headset1", "--kind", "bob=robot", "--json")
+        reported = ("--body", "ann=Headset1", "--kind", "bob=robot", "--json")
         done = share(
-            "dataset", "align", *room.recordings, "--mocap", room.folder / "vicon.csv", *told, "--out", out
+            "dataset",
+            "align",
+            *room.recordings,
+            "--mocap",
+            room.folder / "vicon.csv",
+            *reported,
+            "--out",
+            out,
         )
         assert done.code == 0
         assert all("determines the mounting to" in line for line in done.err.splitlines())  # 12 s are few
@@ -159,8 +166,8 @@ def test_provenance_names_all_inputs(room, made):
 @pytest.mark.slow
 def test_motive_export_with_y_up_gives_the_same(share, room, made, tmp_path):
     """Another clock, which begins with its first frame; the same session."""
-    told = ("--mocap", room.folder / "take.csv", "--json", "--out", tmp_path / "made")
-    done = share("dataset", "align", room.recordings[1], *told)
+    reported = ("--mocap", room.folder / "take.csv", "--json", "--out", tmp_path / "made")
+    done = share("dataset", "align", room.recordings[1], *reported)
     assert done.code == 0 and "bob: the motion capture's up axis is y; the session's is z" in done.err
     found, was = json.loads(done.out)["bob"], read_json(made / "align.json")["bob"]
     assert found["up"] == "y" and was["up"] == "z"
@@ -176,8 +183,8 @@ def test_euroc_folder_is_converted(share, room, tmp_path):
     """As one recording, and the truth is the one that was found, not the folder's."""
     asl = tmp_path / "asl"
     assert share("dataset", "convert", room.session / "bob", "--format", "euroc", "--out", asl).code == 0
-    told = ("--mocap", room.folder / "vicon.csv", "--json", "--out")
-    done = share("dataset", "align", f"bob={asl}", *told, tmp_path / "one")
+    reported = ("--mocap", room.folder / "vicon.csv", "--json", "--out")
+    done = share("dataset", "align", f"bob={asl}", *reported, tmp_path / "one")
     assert done.code == 0
     assert sorted(p.name for p in (tmp_path / "one").iterdir() if p.suffix) == [
         "align.json",
@@ -200,8 +207,8 @@ def test_given_calibration_and_mounting_are_used(share, room, tmp_path):
     T = WATCHED["bob"].T_body_mocap
     sigma = "{rotation_deg: [0.005, 0.005, 0.005], position_m: [0.0001, 0.0001, 0.0001]}"
     (tmp_path / "mocap.yaml").write_text(f"T_body_mocap: {T.tolist()}\nsigma: {sigma}\n")
-    told = ("--mocap", room.folder / "vicon.csv", "--calib", tmp_path, "--mounting", f"bob={tmp_path}")
-    done = share("dataset", "align", room.recordings[1], *told, "--json", "--out", tmp_path / "made")
+    reported = ("--mocap", room.folder / "vicon.csv", "--calib", tmp_path, "--mounting", f"bob={tmp_path}")
+    done = share("dataset", "align", room.recordings[1], *reported, "--json", "--out", tmp_path / "made")
     assert (done.code, done.err) == (0, "")
     found = json.loads(done.out)["bob"]
     np.testing.assert_allclose(found["T_body_mocap"], T, atol=5e-4)
@@ -265,8 +272,8 @@ def test_real_recording_with_processed_motion_capture(share, shared_data, tmp_pa
     lines = (folder / "mav0" / "state_groundtruth_estimate0" / "data.csv").read_text().splitlines()[1:]
     rows = (line.split(",") for line in lines)
     away = 1_403_715_000_000_000_000
-    told = (",".join([str(int(stamp) - away), *values[:7]]) for stamp, *values in rows)
-    (tmp_path / "seen.csv").write_text("\n".join(told) + "\n")
+    reported = (",".join([str(int(stamp) - away), *values[:7]]) for stamp, *values in rows)
+    (tmp_path / "seen.csv").write_text("\n".join(reported) + "\n")
     options = ("--mocap", tmp_path / "seen.csv", "--sigma-mm", "1.5", "--json", "--out", tmp_path / "made")
     done = share("dataset", "align", f"ann={folder}", *options)
     found = json.loads(done.out)["ann"]

@@ -57,19 +57,19 @@ def test_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, t
     assert [row["agent"] for row in rows] == ["ar1", "ar2", "robot"]
     assert {row["frames"] for row in rows} == {"45"}
     assert rows == rows_of(out / "agents.csv")
-    told = json.loads(evaluate("score", run, "--json").out)["runs"][0]
+    reported = json.loads(evaluate("score", run, "--json").out)["runs"][0]
     where = {"session": plain_session.name, "policy": "covins-g", "link": "", "seed": 0}
-    assert told["conditions"] == {
+    assert reported["conditions"] == {
         **where,
         "clock": "real time",
         "error_source": "the true error",
-        "code": told["record"]["code"],
+        "code": reported["record"]["code"],
     }
-    assert told["agents"][0]["odom_n"] == 45
+    assert reported["agents"][0]["odom_n"] == 45
     edge = json.loads((run / "edge" / "edge.json").read_text())
     assert ("last_solve_s" in edge) == (edge["solve_ms"]["n"] > 0)
-    assert told["record"]["machine"]["cores"] >= 1
-    assert told["agents"][0]["latency_ms"] == pytest.approx(float(rows[0]["latency_ms"]), rel=1e-5)
+    assert reported["record"]["machine"]["cores"] >= 1
+    assert reported["agents"][0]["latency_ms"] == pytest.approx(float(rows[0]["latency_ms"]), rel=1e-5)
 
     again = evaluate("run", plain_session, "--out", run)
     assert again.code == 2

@@ -34,9 +34,9 @@ def _brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def asked(done: Done) -> dict[str, object]:
     """The one clock of `check --json`."""
-    told = json.loads(done.out)
-    (clock,) = told["clocks"]
-    assert told["ok"] == (clock["wrong"] is None) == (done.code == 0)
+    reported = json.loads(done.out)
+    (clock,) = reported["clocks"]
+    assert reported["ok"] == (clock["wrong"] is None) == (done.code == 0)
     return dict(clock)
 
 
@@ -253,9 +253,9 @@ def test_server_survives_any_input_and_ends_cleanly(number: int, share: Share) -
     assert (clock["stratum"], clock["answers"]) == (7, 8)
     assert process.returncode == 0
     counts = r"rate-limited: 0, invalid: (\d+)"
-    told = re.fullmatch(rf"answered: (\d+), clients: 1 \(last 127\.0\.0\.1\), {counts}\n", out)
-    assert told, out
-    assert int(told[1]) + int(told[2]) == 108
+    reported = re.fullmatch(rf"answered: (\d+), clients: 1 \(last 127\.0\.0\.1\), {counts}\n", out)
+    assert reported, out
+    assert int(reported[1]) + int(reported[2]) == 108
     assert err == "share sync: new client: 127.0.0.1\n"
 
 

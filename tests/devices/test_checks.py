@@ -28,9 +28,9 @@ def test_usb_3_link_has_at_least_5000_mbit(mbit_s: float, state: str) -> None:
 )
 def test_firmware_versions_are_compared_as_numbers(found: str, state: str) -> None:
     good = ["5.13.0.50", "5.16.0.1"]
-    told = camera_check.check_firmware(SdkReport(firmware=(found,)), good, "5.12.0.0")
-    assert told.state.value == state
-    assert any("librealsense2-utils" in line for line in told.fix) == (state != "OK")
+    reported = camera_check.check_firmware(SdkReport(firmware=(found,)), good, "5.12.0.0")
+    assert reported.state.value == state
+    assert any("librealsense2-utils" in line for line in reported.fix) == (state != "OK")
 
 
 def test_newer_firmware_passes() -> None:
@@ -225,13 +225,13 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
     node.parent.mkdir(parents=True)
     node.touch()
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=True, may_start_imu=None)]
-    for told in (
+    for reported in (
         [],
         [f"# {rule}" for rule in camera_check.UDEV_RULES],
         camera_check.UDEV_RULES[:1],
         camera_check.UDEV_RULES[1:2],
     ):
-        (rules / "9.rules").write_text("\n".join(told))
+        (rules / "9.rules").write_text("\n".join(reported))
         assert facts.camera_rules(tmp_path) == []  # the IMU as well as the camera
     (rules / "9.rules").write_text("\n".join(camera_check.UDEV_RULES))
     assert facts.camera_rules(tmp_path) == ["/etc/udev/rules.d/9.rules"]

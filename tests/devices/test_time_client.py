@@ -70,17 +70,17 @@ def test_invalid_replies_are_refused(changed: dict[str, object], reason: str) ->
 
 def test_kiss_of_death_has_its_code() -> None:
     kiss = replace(GOOD, stratum=0, refid=b"RATE")
-    with pytest.raises(KissError, match=r"refuses to answer \(RATE\)") as told:
+    with pytest.raises(KissError, match=r"refuses to answer \(RATE\)") as reported:
         parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
-    assert told.value.code == "RATE"
+    assert reported.value.code == "RATE"
 
 
 def test_kiss_of_death_with_a_wrong_nonce_is_invalid() -> None:
     """Otherwise any host could make a client give up its server."""
     kiss = replace(GOOD, stratum=0, refid=b"DENY", origin=1)
-    with pytest.raises(ValueError, match="another request") as told:
+    with pytest.raises(ValueError, match="another request") as reported:
         parse_reply(kiss.encode(), NONCE, NOW, NOW + MS)
-    assert not isinstance(told.value, KissError)
+    assert not isinstance(reported.value, KissError)
 
 
 @pytest.mark.long

@@ -63,7 +63,6 @@ ALLOWED = {
     ("net/keys.py", "open"): "a new file that nobody else can read",
     ("net/keys.py", "fdopen"): "likewise",
     ("cameras/live.py", "open"): "a camera",
-    ("runtime/machine.py", "read_text"): KERNEL,
     ("lab/evaluate/provenance.py", "read_text"): KERNEL,
     ("store/database.py", "connect"): "after check_is_map",
     ("store/database.py", "open"): "O_NOFOLLOW, and checked",

@@ -19,7 +19,7 @@ from helpers.recordings import make_euroc, make_tum
 from helpers.ssh_server import HOST, ssh_server
 
 from share import __version__
-from share.cli.main import COMMANDS
+from share.cli.commands import COMMANDS
 
 MB = 1_000_000
 
@@ -54,13 +54,13 @@ def test_version_and_help_at_once(share):
         began = time.monotonic()
         listed = share("--help").stdout
         took.append(time.monotonic() - began)
-    assert all(name in listed for name in COMMANDS)
+    assert all(name in listed for name in COMMANDS if " " not in name)
     assert min(took) < 0.5
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_of_the_table_is_in_it(share, name):
-    assert share(name, "--help").stdout.startswith(f"Usage: share {name}")
+    assert share(*name.split(), "--help").stdout.startswith(f"Usage: share {name}")
 
 
 def test_recordings_of_all_kinds_are_read_and_written(share, tmp_path):
@@ -70,8 +70,8 @@ def test_recordings_of_all_kinds_are_read_and_written(share, tmp_path):
     share("dataset", "recover", mcap, "--out", tmp_path / "again.mcap")
     sources = {euroc: 6, mcap: 6, tmp_path / "back": 6, tmp_path / "again.mcap": 6, tum: 5}
     for source, frames in sources.items():
-        told = json.loads(share("dataset", "info", source, "--json").stdout)
-        assert told["streams"]["cam0"]["count"] == frames
+        reported = json.loads(share("dataset", "info", source, "--json").stdout)
+        assert reported["streams"]["cam0"]["count"] == frames
 
 
 def test_wrong_use_is_one_line(share):
@@ -203,5 +203,5 @@ def test_it_is_put_onto_a_device(program, tmp_path):
         done = device.deploy(*command, host=HOST, ssh=ssh, dist=program.parent)
     assert done.code == 0, done.err
     there = device.root / "opt" / "share" / "current" / "share"
-    told = subprocess.run([there, "--version"], env={}, capture_output=True, text=True, check=True).stdout
-    assert told.split()[-1] == __version__ == (program.parent / "VERSION").read_text().strip()
+    reported = subprocess.run([there, "--version"], env={}, capture_output=True, text=True, check=True).stdout
+    assert reported.split()[-1] == __version__ == (program.parent / "VERSION").read_text().strip()

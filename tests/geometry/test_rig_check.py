@@ -84,10 +84,10 @@ def test_usual_rigs_pass(rig: Rig) -> None:
     ],
 )
 def test_unusable_rigs_are_refused_with_the_reason(rig: Rig, says: str) -> None:
-    told = rig_problem(rig)
-    assert told is not None
-    assert any(part in told for part in says.split("|")), told
-    assert "\n" not in told and len(told) < 250
+    reported = rig_problem(rig)
+    assert reported is not None
+    assert any(part in reported for part in says.split("|")), reported
+    assert "\n" not in reported and len(reported) < 250
 
 
 def test_a_lens_is_checked_alone() -> None:

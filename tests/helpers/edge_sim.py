@@ -74,7 +74,7 @@ class Weather:
         self._rng = np.random.default_rng(self.seed)
 
     def delays_ns(self) -> list[int]:
-        """Of each copy that arrives."""
+        """Return the delay of each copy that arrives."""
         rng, (least, most) = self._rng, self.delay_ms
         out = []
         for _ in range(1 + int(self.twice > 0 and rng.random() < self.twice)):
@@ -255,12 +255,12 @@ class Town:
         return float(np.linalg.norm(found[:3, 3] - self.people[self.peer(name)].T_world_body[-1][:3, 3]))
 
     def map_error(self, names: Collection[str]) -> float:
-        """Of all keyframes of these agents, one alignment: RMSE in m; inf unless they are in one map."""
+        """Return the RMSE, m, of all keyframes of these agents, aligned as one; inf unless in one map."""
         assert self.edge is not None
         kept = self.edge.mapper.current_poses()
-        told = {p.name: p.T_world_body for p in self.people.values() if p.name in names}
+        reported = {p.name: p.T_world_body for p in self.people.values() if p.name in names}
         owners = {key.agent: key.agent.rpartition("-")[0] for key in kept.keys}  # a run: name-tag
-        truth = {run: told[name] for run, name in owners.items() if name in told}
+        truth = {run: reported[name] for run, name in owners.items() if name in reported}
         which = [i for i, key in enumerate(kept.keys) if key.agent in truth]
         if len({kept.map_ids[i] for i in which}) > 1:
             return float("inf")

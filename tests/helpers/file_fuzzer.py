@@ -174,20 +174,22 @@ def attempt(read: Callable[[Path], None], path: Path) -> tuple[str, str]:
         sys.stderr = sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         try:
             read(path)
-            told = "well"
+            reported = "well"
         except ShareError as error:
-            told = "failed\nmore than a line" if "\n" in str(error) and len(str(error)) > 3000 else "refused"
+            reported = (
+                "failed\nmore than a line" if "\n" in str(error) and len(str(error)) > 3000 else "refused"
+            )
         except BaseException:
-            told = "failed\n" + traceback.format_exc()
-        os.write(writer, told.encode()[:60_000])
+            reported = "failed\n" + traceback.format_exc()
+        os.write(writer, reported.encode()[:60_000])
         os._exit(0)
     os.close(writer)
     with os.fdopen(reader, "rb") as answer:
-        told = answer.read().decode(errors="replace")
+        reported = answer.read().decode(errors="replace")
     _, status = os.waitpid(child, 0)
-    if not told:
+    if not reported:
         return "failed", f"ended by signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else "ended"
-    how, _, why = told.partition("\n")
+    how, _, why = reported.partition("\n")
     return how, why
 
 
@@ -261,12 +263,12 @@ def _copied(path: Path, folder: Path) -> Path:
 if __name__ == "__main__":
     stop: list[object] = []
     signal.signal(signal.SIGINT, lambda *_: stop.append(True))
-    told, failed = fuzz(
+    reported, failed = fuzz(
         float(sys.argv[1]),
         int(sys.argv[2]) if len(sys.argv) > 2 else 1,
         Path(tempfile.mkdtemp(prefix="fuzz-kept-")),
         "".join(sys.argv[3:4]),
         lambda: bool(stop),
     )
-    print(dict(sorted(told.items())))
+    print(dict(sorted(reported.items())))
     sys.exit(bool(failed))

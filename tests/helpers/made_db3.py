@@ -91,8 +91,8 @@ def make_db3(path: Path, frames: int = 12, texts: Mapping[str, str] | None = Non
 
     def sample(stream: str, number: int, at_ns: int, data: str, message: bytes) -> None:
         write(f"{stream}{data}", at_ns, message)
-        told = f"timestamp={at_ns / 1e6};timestamp_domain=Hardware Clock;Frame number={number}"
-        write(f"{stream}{data[: data.rindex('/data')]}/metadata", at_ns, text(told))
+        reported = f"timestamp={at_ns / 1e6};timestamp_domain=Hardware Clock;Frame number={number}"
+        write(f"{stream}{data[: data.rindex('/data')]}/metadata", at_ns, text(reported))
 
     for k in range(frames):
         for j in range(20):

@@ -26,7 +26,7 @@ def field(number: int, value: int | bytes | str) -> bytes:
 
 
 def tensor(name: str, dims: Sequence[int], values: Sequence[float] = (), extra: bytes = b"") -> bytes:
-    """Of floats; extra: fields of one's own."""
+    """Return a tensor of floats. extra: more fields."""
     head = b"".join(field(1, d) for d in dims) + field(2, FLOAT) + field(8, name)
     return head + field(9, struct.pack(f"<{len(values)}f", *values)) + extra
 

@@ -82,7 +82,7 @@ def with_environment(env: dict[str, str]) -> pytest.MonkeyPatch:
 
 
 def environment(*faults: BadDisk | WallClock) -> dict[str, str]:
-    """Of a process with all of these."""
+    """Return the environment of a process with all of these faults."""
     env = dict(os.environ)
     for fault in faults:
         before = [env["LD_PRELOAD"]] if "LD_PRELOAD" in env else []

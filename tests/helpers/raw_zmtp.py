@@ -35,7 +35,7 @@ def frame(body: bytes, more: bool = False, command: bool = False) -> bytes:
 
 
 def head(size: int, more: bool = False) -> bytes:
-    """Of a frame that says it has `size` bytes, which may never come."""
+    """Return the head of a frame that announces `size` bytes, which may never come."""
     return bytes([LONG | (MORE if more else 0)]) + struct.pack(">Q", size)
 
 
@@ -100,13 +100,13 @@ class RawPeer:
 
     def hear(self, at_least: int) -> bytes:
         """Raises ConnectionError where the other side closes before that many bytes."""
-        heard = b""
-        while len(heard) < at_least:
+        received = b""
+        while len(received) < at_least:
             more = self.socket.recv(65536)
             if not more:
-                raise ConnectionError(f"closed after {len(heard)} bytes")
-            heard += more
-        return heard
+                raise ConnectionError(f"closed after {len(received)} bytes")
+            received += more
+        return received
 
     def closed(self, within_s: float) -> bool:
         """Whether the other side closes in that time."""

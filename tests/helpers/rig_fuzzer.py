@@ -103,10 +103,10 @@ def _camera(rig: Rig, rng: np.random.Generator, **values: object) -> Rig:
 
 
 def _lens(rig: Rig, rng: np.random.Generator) -> tuple[Rig, str]:
-    told = [0.0] * int(rng.choice([4, 5]))
+    reported = [0.0] * int(rng.choice([4, 5]))
     for _ in range(int(rng.integers(1, 4))):
-        told[int(rng.integers(len(told)))] = float(rng.choice(_HUGE))
-    return _camera(rig, rng, distortion=tuple(told)), str(tuple(told))
+        reported[int(rng.integers(len(reported)))] = float(rng.choice(_HUGE))
+    return _camera(rig, rng, distortion=tuple(reported)), str(tuple(reported))
 
 
 def _focal(rig: Rig, rng: np.random.Generator) -> tuple[Rig, str]:
@@ -189,7 +189,7 @@ _CHANGES = {
 
 
 def frames_for(rig: Rig, walk: Walk) -> Iterator[Frame]:
-    """Of the walk, as this rig would deliver them."""
+    """Yield the frames of the walk as this rig would deliver them."""
     for frame in walk.frames:
         yield replace(
             frame,

@@ -43,11 +43,11 @@ class SoftwareCamera:
     ) -> None:
         self.rs, self.device = rs, rs.software_device()
         self._rate_hz, self._lens = rate_hz, lens
-        told = rs.camera_info
-        self.device.register_info(told.serial_number, serial)
-        self.device.register_info(told.name, "Intel RealSense D435I")
-        self.device.register_info(told.firmware_version, firmware)
-        self.device.register_info(told.usb_type_descriptor, usb)
+        reported = rs.camera_info
+        self.device.register_info(reported.serial_number, serial)
+        self.device.register_info(reported.name, "Intel RealSense D435I")
+        self.device.register_info(reported.firmware_version, firmware)
+        self.device.register_info(reported.usb_type_descriptor, usb)
         self.stereo = self.device.add_sensor("Stereo Module")
         self.motion = self.device.add_sensor("Motion Module")
         self.cam = [self._video(rs.stream.infrared, index) for index in (1, 2)]
@@ -118,6 +118,6 @@ class SoftwareCamera:
         return self.motion.add_motion_stream(stream)
 
     def _shift(self, *metres: float) -> Any:
-        told = self.rs.extrinsics()
-        told.rotation, told.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], list(metres)
-        return told
+        reported = self.rs.extrinsics()
+        reported.rotation, reported.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], list(metres)
+        return reported

@@ -53,7 +53,7 @@ def udp(replies: Replies, address: str = "127.0.0.1") -> Iterator[int]:
 
 
 def shifted(offset_ms: float, slow_ms: float = 0.0, **changed: object) -> Replies:
-    """Of a server whose clock is ahead by that much, and that lets a question wait before it notices it."""
+    """Return the replies of a server whose clock is `offset_ms` ahead; it reads requests `slow_ms` late."""
     server, offset_ns = TimeServer(precision=-20), round(offset_ms * MS)
 
     def replies(data: bytes) -> list[bytes]:

@@ -40,7 +40,7 @@ def way(start: float, steps: int) -> Iterator[np.ndarray]:
 
 
 def keyframes(place: Planes, start: float, seed: int, steps: int = 4) -> list[tuple[np.ndarray, Keyframe]]:
-    """Of one run: true poses, and what it sends; its odom is anywhere."""
+    """One run: true poses, and what it sends; its odom is anywhere."""
     rng, found = np.random.default_rng(seed), []
     T_odom_world = se3.exp(rng.normal(0, [0.1, 0.1, 0.1, 1, 1, 1]))
     for k, T in enumerate(way(start, steps)):

@@ -38,8 +38,8 @@ class Rows:
     def csv(self) -> str:
         lines = ["stamp_ns,track_ms,corrected_ms,state,keyframe,sent"]
         for stamp, track, corrected, state, keyframe, sent in sorted(self.rows, key=lambda row: row[0]):
-            told = "" if math.isnan(corrected) else f"{corrected:.3f}"
-            lines.append(f"{stamp},{track:.3f},{told},{state},{int(keyframe)},{int(sent)}")
+            reported = "" if math.isnan(corrected) else f"{corrected:.3f}"
+            lines.append(f"{stamp},{track:.3f},{reported},{state},{int(keyframe)},{int(sent)}")
         return "\n".join(lines) + "\n"
 
     def report(self) -> dict[str, Any]:
@@ -90,8 +90,8 @@ def test_report_equals_that_of_all_rows(n: int, seed: int, in_a_folder: bool, tm
     drive([rows, spooled, in_memory], n, seed)
     assert len(spooled) == n
     for log in (spooled, in_memory):
-        told = log.report()
-        assert json.dumps({key: told[key] for key in rows.report()}) == json.dumps(rows.report())
+        reported = log.report()
+        assert json.dumps({key: reported[key] for key in rows.report()}) == json.dumps(rows.report())
         assert "".join(log.csv_chunks()) == rows.csv()
     spool.close()
 
@@ -103,9 +103,13 @@ def test_counts_beside_the_rows_are_reported() -> None:
     log.add_decode_time(0.25)
     for waits in (WaitReason.IMU, WaitReason.IMU, None):
         log.add_result(waits is None, waits is not None, waits)
-    told = log.report()
-    assert (told["cpu_ms_per_frame"], told["decode_ms_per_frame"]) == (500.0, 250.0)
-    assert (told["segments"], told["inconsistent_frames"], told["waiting_frames"]) == (1, 1, {"imu": 2})
+    reported = log.report()
+    assert (reported["cpu_ms_per_frame"], reported["decode_ms_per_frame"]) == (500.0, 250.0)
+    assert (reported["segments"], reported["inconsistent_frames"], reported["waiting_frames"]) == (
+        1,
+        1,
+        {"imu": 2},
+    )
 
 
 def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:

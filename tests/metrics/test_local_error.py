@@ -18,14 +18,14 @@ def walk() -> np.ndarray:
     return se3.from_rt(se3.so3_exp(np.column_stack([0 * s, 0 * s, s])), t)
 
 
-def told(poses: np.ndarray, **also: bool) -> list[float | None]:
+def reported(poses: np.ndarray, **also: bool) -> list[float | None]:
     error = LocalError((STAMPS, walk()))
     return [error.update(int(stamp), T, **also) for stamp, T in zip(STAMPS, poses, strict=True)]
 
 
 def test_constant_transform_is_no_error() -> None:
     moved = se3.exp(np.array([0.0, 0.0, 1.0, 3.0, -2.0, 0.5])) @ walk()
-    out = told(moved)
+    out = reported(moved)
     assert out[:50] == [None] * 50  # half the window
     assert max(error for error in out[50:] if error is not None) < 1e-9
 
@@ -33,14 +33,14 @@ def test_constant_transform_is_no_error() -> None:
 def test_error_equals_the_noise() -> None:
     poses = walk()
     poses[:, :3, 3] += np.random.default_rng(0).normal(0, 0.01, (len(poses), 3))
-    late = [error for error in told(poses)[150:] if error is not None]
+    late = [error for error in reported(poses)[150:] if error is not None]
     assert np.mean(late) == pytest.approx(np.sqrt(3), rel=0.05)
 
 
 def test_jump_counts_while_it_is_in_the_window() -> None:
     poses = walk()
     poses[200:, 0, 3] += 0.05
-    out = np.array(told(poses)[60:], float)
+    out = np.array(reported(poses)[60:], float)
     assert (out[:140] < 1e-6).all()
     assert 1.0 < out[140:240].max() < 2.5
     assert (out[242:] < 1e-6).all()

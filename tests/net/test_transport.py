@@ -46,7 +46,7 @@ class Net:
 
 
 def keys_in(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
-    """Of an edge and of an agent that it lets in."""
+    """Return the keys of an edge and of an agent that it accepts."""
     edge, ann = generate_pair(folder / "edge", "edge"), generate_pair(folder / "ann", "ann")
     authorize(folder / "edge", "ann", ann.public)
     return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(ann, edge.public)

@@ -132,7 +132,7 @@ class Agent:
         self._thread.join()
 
     def longest(self, since: float) -> float:
-        """Of the trips since then, s; one that has not ended counts as long as it has lasted."""
+        """Return the longest trip since then, s; one that has not ended counts as long as it has lasted."""
         took = [took for sent, took in self.trips if sent >= since]
         return max([*took, time.monotonic() - self._sent])
 

@@ -26,7 +26,7 @@ def source(plain_session):
 
 @pytest.fixture(scope="module")
 def frames(source):
-    """Of a body at rest."""
+    """Return the frames of a body at rest."""
     return list(read_frames(source, Config(), SequencerCounters()))[:12]
 
 

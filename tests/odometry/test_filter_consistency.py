@@ -56,7 +56,7 @@ def test_nees_between_samples_and_with_noise(phase, white):
 @pytest.mark.slow
 @pytest.mark.parametrize("machine", [1.0, 4.0])
 def test_nees_under_vibration(machine):
-    """Of a vibration that its samples follow, an integral loses more than `shaken` knows: it is less sure
+    """If samples follow a vibration, an integral loses more than `shaken` knows: it is less sure
     than it could be, of its orientation."""
     runs = [run(seed, Setup(phase=0.37, imu_hz=400.0, machine=machine)) for seed in range(50)]
     for k in (40, 100, 200, 398):

@@ -114,7 +114,7 @@ def test_correlated_noise_is_shared_by_both_cameras(state):
 
 
 def test_covariance_of_a_relative_pose(state):
-    """Of T_a_b = T_a^-1 T_b, by differences."""
+    """Return the derivative of T_a_b = T_a^-1 T_b, by differences."""
 
     def motion(s):
         return se3.inverse(s.keyframe_poses[0]) @ s.keyframe_poses[1]
@@ -160,7 +160,7 @@ def test_integration_follows_the_path():
 
 @pytest.mark.parametrize(("dt", "close"), [(0.005, 2e-5), (0.0005, 1e-6)])
 def test_transition(dt, close):
-    """Of pose, velocity and biases over 0.1 s. It is that of the motion itself, not of its steps."""
+    """Pose, velocity and biases over 0.1 s. The derivative is that of the motion itself, not of its steps."""
     path = Path(6)
     imu, _, _ = imu_of(path, np.arange(0, 0.205, dt))
     t = np.array([0.05])

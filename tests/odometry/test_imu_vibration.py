@@ -31,7 +31,7 @@ def shown(imu, window_s=0.2):
 
 @pytest.mark.parametrize(("hz", "most"), [(100.0, 1.3), (200.0, 1.1), (400.0, 1.1), (1000.0, 1.1)])
 def test_white_noise_shows_its_density(hz, most, rng):
-    """Of 15 samples, at 100 Hz, the loudest axis shows more."""
+    """With 15 samples, at 100 Hz, the noisiest axis shows more."""
     t = np.arange(0, 12, 1 / hz)
     gyro, accel = (rng.normal(0, density * np.sqrt(hz), (len(t), 3)) for density in (0.003, 0.2))
     ratios = shown(batch(t, gyro, accel)) / (0.003, 0.2)

@@ -98,7 +98,7 @@ def test_every_frame_is_tracked_to_the_centimetre(walk, tracked):
 
 
 def test_the_up_direction(walk, tracked):
-    """Of the body, as keyframes publish it; the accelerometer of a D435i is off by up to 0.2 m/s^2."""
+    """The body's, as keyframes publish it; the accelerometer of a D435i is off by up to 0.2 m/s^2."""
     _, _, truth = walk
     _, candidates, tracker = tracked
     last = tracker.state.stamp_ns
@@ -128,7 +128,7 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
 
 
 def test_keyframes_carry_their_pose_relative_to_earlier_ones_by_the_present_state(walk):
-    """Of those published, as long as the state has them."""
+    """Those published, as long as the state has them."""
     frames, rig, _ = walk
     tracker, published, known = InertialTracker(rig, InertialConfig(), TrackerConfig()), {}, 0
     for frame in frames:

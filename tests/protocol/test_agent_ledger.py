@@ -85,7 +85,7 @@ def reaching_back(k: int, *candidates: int, new_segment: bool = False) -> Keyfra
 
 
 def chain_of(sent: Collection[int], n: int, back: int = 20) -> tuple[KeyframeChain, list[Keyframe]]:
-    """Of n candidates, with stamps 0 .. n - 1; those `sent` become keyframes."""
+    """Return the chain of n candidates with stamps 0 .. n - 1; those `sent` become keyframes."""
     chain, made = KeyframeChain(), []
     for k in range(n):
         one = reaching_back(k, *range(max(0, k - back), k)) if k else candidate(0)

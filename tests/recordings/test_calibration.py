@@ -209,8 +209,8 @@ DEPTH = """depth:
 def test_what_a_rig_lacks_is_kept_from_its_original_calibration(tmp_path):
     """Also without the IMU chain: the rig then has no IMU."""
     T = matrix(se3.inverse(T_CAM0_IMU))
-    told = f"  T_imu_cam: {T}\n  timeshift_cam_imu: 0.004\n  rostopic: /left/image\n"
-    path = write(tmp_path, chain(told) + DEPTH, None) / CAMCHAIN
+    reported = f"  T_imu_cam: {T}\n  timeshift_cam_imu: 0.004\n  rostopic: /left/image\n"
+    path = write(tmp_path, chain(reported) + DEPTH, None) / CAMCHAIN
     given = read_calibration(path)
     assert given.rig.imu is None and given.rig.timeshift_s == 0
     written = to_kalibr(given.rig, given)

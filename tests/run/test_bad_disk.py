@@ -189,14 +189,14 @@ def test_an_agent_whose_disk_does_not_answer(tmp_path: Path, plain_session: Path
     disk.hangs()
     edge.wait_for("left: ann: sent bye")
     with urllib.request.urlopen(f"{page}snapshot.json", timeout=5) as answer:
-        told = json.load(answer)["agents"]["ann"]
+        reported = json.load(answer)["agents"]["ann"]
     if not lasting:
         disk.is_well()
     code = agent.wait(ENDS_S)
     disk.is_well()
     edge.kill()
     assert "Traceback" not in agent.said
-    assert told["poses"] > 30
+    assert reported["poses"] > 30
     if lasting:
         assert code == 1
         assert agent.said.endswith("ann: is not complete: its disk does not answer\n")

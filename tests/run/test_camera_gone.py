@@ -58,7 +58,7 @@ def test_a_disconnected_camera_is_reported_everywhere_within_a_second(
         with urllib.request.urlopen(f"http://127.0.0.1:{http}/snapshot.json", timeout=5) as answer:
             return dict(json.load(answer)["agents"]["ann"])
 
-    def told() -> str:
+    def reported() -> str:
         state = ""
         while True:
             try:
@@ -71,9 +71,9 @@ def test_a_disconnected_camera_is_reported_everywhere_within_a_second(
         time.sleep(1.0)
         end = room.play(lambda: time.sleep(1 / HZ))
         before = shown()
-        told()
+        reported()
         time.sleep(1.0)  # and nothing comes
-        gone, datagram = shown(), told()
+        gone, datagram = shown(), reported()
         time.sleep(2.0)
         later = shown()
         room.play(lambda: time.sleep(1 / HZ), 100_000 + end)

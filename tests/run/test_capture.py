@@ -77,8 +77,8 @@ def test_backward_and_missing_frames_are_counted_and_skipped(tmp_path: Path) -> 
         after = bench.feed(1_000_000, 4)
         bench.camera.image(0, after - 100_000, PICTURE)
         bench.camera.image(0, after + 66_666, PICTURE, skip=2)
-    told = bench.report["streams"]["cam0"]
-    assert (told["samples"], told["backward"], told["missing"], told["gaps"]) == (5, 1, 3, 1)
+    reported = bench.report["streams"]["cam0"]
+    assert (reported["samples"], reported["backward"], reported["missing"], reported["gaps"]) == (5, 1, 3, 1)
     assert len(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) == 5
 
 
@@ -126,11 +126,11 @@ def test_a_slow_disk_costs_images_that_are_counted_and_never_the_imu(
     monkeypatch.setattr(Recorder, "write", slow)
     with Bench(tmp_path / "a.mcap", most_images=8) as bench:
         bench.feed(1_000_000, 30)
-    told = bench.report["streams"]
-    assert told["cam0"]["dropped"] > 5
-    assert told["cam0"]["dropped"] == told["cam1"]["dropped"]
-    assert told["cam0"]["samples"] + told["cam0"]["dropped"] == 30
-    assert (told["gyro"]["dropped"], told["gyro"]["missing"]) == (0, 0)
+    reported = bench.report["streams"]
+    assert reported["cam0"]["dropped"] > 5
+    assert reported["cam0"]["dropped"] == reported["cam1"]["dropped"]
+    assert reported["cam0"]["samples"] + reported["cam0"]["dropped"] == 30
+    assert (reported["gyro"]["dropped"], reported["gyro"]["missing"]) == (0, 0)
 
 
 def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: Path) -> None:

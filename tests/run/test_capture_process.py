@@ -54,9 +54,9 @@ def test_ctrl_c_completes_the_file(tmp_path: Path, number: int) -> None:
     with capturing(out, "--json") as child:
         grown(tmp_path / "a.mcap.part", 10_000_000)
         child.send_signal(number)
-        told, complaints = child.communicate(timeout=20)
+        reported, complaints = child.communicate(timeout=20)
     assert (child.returncode, complaints) == (0, "")
-    report = json.loads(told)
+    report = json.loads(reported)
     assert report["end_reason"] == "stopped"
     assert len(open_source(str(out)).stamps()["cam0"]) == report["streams"]["cam0"]["samples"] > 10
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
@@ -90,8 +90,8 @@ def test_a_second_ctrl_c_names_the_command_that_saves_the_file(tmp_path: Path) -
         child.send_signal(signal.SIGINT)
         time.sleep(0.3)
         child.send_signal(signal.SIGINT)
-        told, complaints = child.communicate(timeout=20)
-    assert (child.returncode, told) == (130, "")
+        reported, complaints = child.communicate(timeout=20)
+    assert (child.returncode, reported) == (130, "")
     assert complaints.splitlines() == [
         f"share: {part}: is not closed; `share dataset recover {part} --out {tmp_path / 'a.mcap'}` "
         "saves its contents",
@@ -114,7 +114,7 @@ def test_a_recording_cut_off_by_a_power_failure_is_recovered(tmp_path: Path) -> 
 @pytest.mark.long
 def test_it_ends_when_the_time_is_over_and_prints_a_table(tmp_path: Path) -> None:
     with capturing(tmp_path / "a.mcap", "--seconds", "1") as child:
-        told, complaints = child.communicate(timeout=30)
+        reported, complaints = child.communicate(timeout=30)
     assert complaints == ""
-    assert told.splitlines()[0].split()[:3] == ["stream", "samples", "seconds"]
-    assert told.splitlines()[-1] == f"{tmp_path / 'a.mcap'} (time is over)"
+    assert reported.splitlines()[0].split()[:3] == ["stream", "samples", "seconds"]
+    assert reported.splitlines()[-1] == f"{tmp_path / 'a.mcap'} (time is over)"

@@ -99,8 +99,8 @@ def test_of_an_interleaved_emitter_the_images_without_dots_are_recorded(tmp_path
     images = [m.payload.load() for m in source.measurements() if m.stream != "imu"]
     assert len(images) == 20
     assert all(np.array_equal(image, PICTURE) for image in images)
-    told = bench.report["streams"]["cam0"]
-    assert (told["gaps"], told["missing"]) == (0, 0)
+    reported = bench.report["streams"]["cam0"]
+    assert (reported["gaps"], reported["missing"]) == (0, 0)
 
 
 @pytest.mark.long

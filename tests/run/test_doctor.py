@@ -49,9 +49,9 @@ def guarded(tmp_path: Path, share: Share) -> Iterator[Guarded]:
 
 
 def of_edge(done: Done) -> dict[str, object]:
-    told = json.loads(done.out)
-    (found,) = [one for one in told["findings"] if one["name"] == "edge"]
-    assert told["ok"] == (done.code == 0) == all(one["state"] != "FAIL" for one in told["findings"])
+    reported = json.loads(done.out)
+    (found,) = [one for one in reported["findings"] if one["name"] == "edge"]
+    assert reported["ok"] == (done.code == 0) == all(one["state"] != "FAIL" for one in reported["findings"])
     return dict(found)
 
 
@@ -63,7 +63,9 @@ def test_a_used_port_is_reported(share: Share, monkeypatch: pytest.MonkeyPatch) 
         taken = json.loads(share("doctor", *LAPTOP, "--json").out)
     free = json.loads(share("doctor", *LAPTOP, "--json").out)
     of_agent = json.loads(share("doctor", "--json").out)
-    state = [{one["name"]: one["state"] for one in told["findings"]} for told in (taken, free, of_agent)]
+    state = [
+        {one["name"]: one["state"] for one in reported["findings"]} for reported in (taken, free, of_agent)
+    ]
     assert [found.get("port") for found in state] == ["WARN", "OK", None]
 
 
@@ -179,8 +181,8 @@ def test_a_service_that_resets_the_governor_is_found(tmp_path: Path) -> None:
 
 def test_keys_of_an_edge_are_checked(share: Share, tmp_path: Path) -> None:
     def keys_of(folder: Path) -> tuple[str, str, list[str]]:
-        told = json.loads(share("doctor", *LAPTOP, "--keys", folder, "--json").out)
-        return next((f["state"], f["what"], f["mend"]) for f in told["findings"] if f["name"] == "keys")
+        reported = json.loads(share("doctor", *LAPTOP, "--keys", folder, "--json").out)
+        return next((f["state"], f["what"], f["mend"]) for f in reported["findings"] if f["name"] == "keys")
 
     state, what, mend = keys_of(tmp_path / "none")
     assert (state, mend) == ("WARN", ["share keys generate"]) and "this machine alone" in what

@@ -126,7 +126,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
 
 
 def kept_ids(path: Path, to: Path) -> list[int]:
-    """Of a map as it is on the disk now, read from a copy."""
+    """Return the ids in a map as it is on the disk now, read from a copy."""
     to.mkdir()
     for file in path.parent.glob("room.sqlite*"):
         shutil.copyfile(file, to / file.name)

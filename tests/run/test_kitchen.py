@@ -114,6 +114,8 @@ def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):
         assert (tmp_path / name / "odom.tum").read_bytes() == tracked[name]
         own = json.loads((tmp_path / name / "report.json").read_text())
         assert report["agents"][name]["keyframes"] == own["sent"] <= own["keyframes"]
-        told = [e["map_id"] for e in _events(tmp_path) if (e["event"], e["agent"]) == ("correction", name)]
-        assert own["protocol"]["map_id"] in told[-2:]  # the last may come when the agent has said goodbye
+        reported = [
+            e["map_id"] for e in _events(tmp_path) if (e["event"], e["agent"]) == ("correction", name)
+        ]
+        assert own["protocol"]["map_id"] in reported[-2:]  # the last may come when the agent has said goodbye
         assert own["protocol"]["edge_sessions"] == 2

@@ -45,7 +45,7 @@ def running(seen: Path, *arguments: object) -> Iterator[tuple[subprocess.Popen[s
 
 
 def shown(terminal: int) -> str:
-    """What is written there until a rate is told, which takes a second."""
+    """What is written there until a rate is known, which takes a second."""
     text, end = "", time.monotonic() + 30
     while not re.search(r"cam0 [1-9]", text):
         assert time.monotonic() < end, text[-300:]
@@ -56,14 +56,14 @@ def shown(terminal: int) -> str:
 def ended(child: subprocess.Popen[str], terminal: int) -> tuple[str, str]:
     """After Ctrl-C: stdout, and what the terminal shows after it."""
     child.send_signal(signal.SIGINT)
-    told, _ = child.communicate(timeout=40)
+    reported, _ = child.communicate(timeout=40)
     text = ""
     try:
         while piece := os.read(terminal, 4096).decode():
             text += piece
     except OSError:  # nobody writes there any more
         pass
-    return told, text
+    return reported, text
 
 
 @pytest.mark.long
@@ -72,10 +72,10 @@ def test_ctrl_c_ends_tracking_with_poses_and_a_report(tmp_path: Path, plain_sess
     line = ("track", "realsense:0123", *MODE, "--out", out, "--report", report)
     with running(plain_session / "ar1", *line) as (child, terminal):
         live = shown(terminal)
-        told, after = ended(child, terminal)
+        reported, after = ended(child, terminal)
     assert child.returncode == 0, (child.returncode, after[-500:])
     assert re.search(r"\r\x1b\[K\d+ frames  tracking OK  camera OK  accel", live), live
-    assert "camera: missing " in told
+    assert "camera: missing " in reported
     known = json.loads(report.read_text())
     assert known["camera"]["health"] == "OK"
     assert known["camera"]["streams"]["gyro"]["dropped"] == 0
@@ -89,13 +89,13 @@ def test_ctrl_c_completes_the_files_of_an_agent(tmp_path: Path, plain_session: P
     save_bias("0123", SavedBias(10**9 * int(time.time() - 60), ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2)))
     with running(plain_session / "ar1", *who, "--edge", "tcp://127.0.0.1:9", "--out", tmp_path) as (child, t):
         live = shown(t)
-        told, after = ended(child, t)
+        reported, after = ended(child, t)
     assert child.returncode == 1
     assert "no edge answered" in after
     assert re.search(r"\r\x1b\[K\d+ OK.* camera OK cam0 \d+ Hz dropped \d+  sent 0", live), live
-    assert "camera: missing " in told
+    assert "camera: missing " in reported
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["camera"]["streams"]["accel"]["dropped"] == 0
-    assert f"imu bias: from the run of {report['imu_bias']['learnt_at']}\n" in told
+    assert f"imu bias: from the run of {report['imu_bias']['learnt_at']}\n" in reported
     assert report["track_ms"]["p50"] > 0  # from the image's arrival
     assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == report["tracked"] > 10

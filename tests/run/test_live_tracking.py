@@ -62,7 +62,7 @@ def original(room: RoomCamera) -> TrackingOutput:
 def test_a_recorded_camera_is_tracked_as_the_original(
     room: RoomCamera, original: TrackingOutput, tmp_path: Path
 ) -> None:
-    feed, said = room.feed(STEREO, SampleQueue(), told := []), told
+    feed, said = room.feed(STEREO, SampleQueue(), reported := []), reported
     room.begin(feed)
     run = Capture(feed, tmp_path / "a.mcap", 0.0, said.append)
     feed_stopped = feed.stop
@@ -170,17 +170,17 @@ def test_a_reconnected_camera_is_tracked_with_its_new_clock(plain_session: Path)
     source = LiveSource(room.feed(STEREO, NewestImageQueue(200), said, quick), HZ)
     feed = source.feed
 
-    def heard(text: str) -> Callable[[], bool]:
+    def received(text: str) -> Callable[[], bool]:
         return lambda: any(text in line for line in said)
 
     def plugged() -> None:
         time.sleep(0.2)
         room.play(room.taken(feed))
         room.there = False
-        wait_for(heard("waiting for camera"))
+        wait_for(received("waiting for camera"))
         time.sleep(0.3)
         room.there = True
-        wait_for(heard("connected again"))
+        wait_for(received("connected again"))
         room.play(lambda: time.sleep(1 / HZ), begin_us=0)
         wait_for(lambda: feed.processor.streams["cam0"].samples == 90)
         feed.stop()

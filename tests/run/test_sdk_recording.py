@@ -30,10 +30,10 @@ class Turned(SoftwareCamera):
     """Its right eye is turned about all axes."""
 
     def _shift(self, *metres: float) -> Any:
-        told = super()._shift(*metres)
+        reported = super()._shift(*metres)
         if metres[0] == -BASELINE:
-            told.rotation = se3.exp(np.array([0.1, 0.2, 0.3, 0, 0, 0]))[:3, :3].ravel(order="F").tolist()
-        return told
+            reported.rotation = se3.exp(np.array([0.1, 0.2, 0.3, 0, 0, 0]))[:3, :3].ravel(order="F").tolist()
+        return reported
 
 
 def recorded(session: Path, name: str, out: Path) -> RoomCamera:
@@ -112,9 +112,9 @@ def test_it_is_converted_and_described(
     stereo: tuple[RoomCamera, Path], share: Callable[..., Done], tmp_path: Path
 ) -> None:
     _, path = stereo
-    told = share("dataset", "info", path)
-    assert (told.code, "stereo+imu" in told.out, "profile d435i" in told.out) == (0, True, True)
-    assert "device 0123" in told.out
+    reported = share("dataset", "info", path)
+    assert (reported.code, "stereo+imu" in reported.out, "profile d435i" in reported.out) == (0, True, True)
+    assert "device 0123" in reported.out
     assert share("dataset", "convert", path, "--frames", "5:15", "--out", tmp_path / "a.mcap").code == 0
     converted = open_source(str(tmp_path / "a.mcap"))
     stamps = converted.stamps()

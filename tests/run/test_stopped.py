@@ -63,9 +63,9 @@ def test_an_agent_is_stopped(tmp_path, plain_session):
     names = [event["event"] for event in events]
     assert names.index("silent") < names.index("reconnected") < names.index("left")
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
-    told = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
+    reported = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
     assert (report["protocol"]["pending"], report["frames"]) == (0, 45)
-    assert told["keyframes"] == report["protocol"]["acknowledged"]
+    assert reported["keyframes"] == report["protocol"]["acknowledged"]
 
 
 def test_agents_are_killed_again_and_again(tmp_path, plain_session):

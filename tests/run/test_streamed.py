@@ -59,8 +59,8 @@ def test_poses_are_those_of_share_track(
     }
     assert [agent.wait(60) for agent in agents.values()] == [0, 0], agents["ann"].said
     assert edge.interrupt() == 0
-    told = json.loads((tmp_path / "edge" / "edge.json").read_text())
-    assert "maps" not in told
+    reported = json.loads((tmp_path / "edge" / "edge.json").read_text())
+    assert "maps" not in reported
     for name, source in who.items():
         report = report_of(tmp_path, name)
         assert (report["frames"], report["untracked"]) == (FRAMES, 0)
@@ -70,7 +70,7 @@ def test_poses_are_those_of_share_track(
         assert len(rows) == 1 + FRAMES
         assert report["track_ms"]["mean"] > (40 if link else 1)  # 616 kB at 150 Mbit/s take 34 ms
         assert report["protocol"]["poses"] == report["sent"] == 0
-        of_edge = told["agents"][name]
+        of_edge = reported["agents"][name]
         assert (of_edge["frames_streamed"], of_edge["frames_tracked"]) == (FRAMES, FRAMES)
         assert of_edge["frames_dropped"] == of_edge["keyframes"] == 0
         assert of_edge["bytes_up"] > FRAMES * 2 * 640 * 480
@@ -110,9 +110,9 @@ def test_a_tracker_that_is_killed_costs_its_agent_only(
     assert of_hit["frames"] + of_hit["untracked"] == FRAMES
     assert of_hit["segments"] == 2
     assert of_hit["tracked"] > FRAMES / 3
-    told = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]
-    assert told[hit]["frames_dropped"] <= of_hit["untracked"]  # which counts answers that came late, too
-    assert told[other]["frames_dropped"] == 0
+    reported = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]
+    assert reported[hit]["frames_dropped"] <= of_hit["untracked"]  # which counts answers that came late, too
+    assert reported[other]["frames_dropped"] == 0
 
 
 def await_poses(*files: Path) -> None:

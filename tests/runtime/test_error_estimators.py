@@ -71,9 +71,9 @@ def test_an_estimate_holds_until_the_next():
     assert errors.update(frame(1), TRACKED) == pytest.approx(3)
     assert errors.update(frame(2), LOST) is None  # there is no pose that could be wrong
     errors.close()
-    told = errors.report()["error_model"]
-    assert told["estimate_ms"]["n"] == 1
-    assert (told["dropped_estimates"], told["unfamiliar"], said) == (0, 0, [])
+    reported = errors.report()["error_model"]
+    assert reported["estimate_ms"]["n"] == 1
+    assert (reported["dropped_estimates"], reported["unfamiliar"], said) == (0, 0, [])
 
 
 def test_timings_cover_the_newest_estimates(monkeypatch):

@@ -94,10 +94,10 @@ def test_a_tracker_that_fails_twice_is_replaced(
 
 def test_the_bias_outlives_a_replaced_tracker(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
     learnt = ImuBias([0.01, 0.0, 0.0], [0.1, 0.2, 0.3], 1e-3, 1e-2)
-    told = iter([None, learnt, None])
-    monkeypatch.setattr(InertialTracker, "bias", property(lambda self: next(told)))
+    reported = iter([None, learnt, None])
+    monkeypatch.setattr(InertialTracker, "bias", property(lambda self: next(reported)))
     tracker = GuardedTracker(RIG, Config(), FaultGuard(lambda text: None), learnt)
-    assert tracker.bias is None  # what it was told is not what it has learnt
+    assert tracker.bias is None  # a given bias is not an estimated one
     tracker.track(walk.frames[0])
     monkeypatch.setattr(InertialTracker, "make_keyframe", lambda self, frame: None)
     biases = []
@@ -173,10 +173,10 @@ def test_the_unchanged_rig_is_tracked_without_a_failure(walk: rig_fuzzer.Walk) -
 
 
 def test_the_fuzzer_makes_accepted_and_refused_rigs() -> None:
-    told = [rig_check.rig_problem(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
-    count = sum(why is not None for why in told)
+    reported = [rig_check.rig_problem(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
+    count = sum(why is not None for why in reported)
     assert 60 < count < 190
-    assert len({str(why)[:25] for why in told}) > 10
+    assert len({str(why)[:25] for why in reported}) > 10
 
 
 @pytest.mark.slow

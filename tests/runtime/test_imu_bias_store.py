@@ -20,7 +20,7 @@ LEARNT = ImuBias([0.004, -0.005, 0.006], [0.1, -0.2, 0.25], 2e-4, 4e-3)
 
 
 class Camera(LiveSource):
-    """Of which nothing is asked but who it is."""
+    """A live camera with a serial number and a rig, and nothing else."""
 
     def __init__(self, serial: str = "0123", rig: Any = RIG) -> None:
         self.serial, self.rig = serial, rig

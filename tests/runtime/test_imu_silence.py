@@ -39,11 +39,13 @@ def said_of(source: Source) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("from_s", "to_s", "told"), [(1.0, 9.0, "1.0 s"), (-9.0, 9.0, "0.0 s"), (0.5, 2.0, "0.5 s")]
+    ("from_s", "to_s", "reported"), [(1.0, 9.0, "1.0 s"), (-9.0, 9.0, "0.0 s"), (0.5, 2.0, "0.5 s")]
 )
-def test_an_imu_that_stops_is_reported_once(tmp_path: Path, from_s: float, to_s: float, told: str) -> None:
+def test_an_imu_that_stops_is_reported_once(
+    tmp_path: Path, from_s: float, to_s: float, reported: str
+) -> None:
     (line,) = said_of(silenced(tmp_path, from_s, to_s))
-    assert line.startswith(f"no IMU samples from {told} on, for at least 1 s; ")
+    assert line.startswith(f"no IMU samples from {reported} on, for at least 1 s; ")
 
 
 def test_a_short_silence_is_not_reported(tmp_path: Path) -> None:

@@ -193,7 +193,7 @@ def test_a_damaged_read_only_map_is_no_longer_used():
 
 
 def test_runs_without_a_credential_are_unknown_to_an_edge_with_keys(path):
-    """Of the map of `small_map`, a key speaks for Ann."""
+    """In `small_map`, a key acts for Ann."""
     for has_keys, bob in ((True, None), (False, "")):
         store = MapStore.read(path)
         kept, known = MapperRestarts(store, 0.05, print, has_keys).load_map()

@@ -60,9 +60,9 @@ def test_a_pose_arrives_as_published(app):
     }
     assert (second["sequence"], second["stamp_ns"], second["age_ms"]) == (1, 456, 7.123)
     assert (second["segment"], second["map_id"]) == (1, "bob-1/0")
-    for told, T in ((second["odom"], T_odom), (second["map"], T_map)):
-        assert np.allclose(told["position"], T[:3, 3], atol=1e-9)
-        assert np.allclose(matrix_from_quat(np.array(told["quaternion"])), T[:3, :3], atol=1e-8)
+    for reported, T in ((second["odom"], T_odom), (second["map"], T_map)):
+        assert np.allclose(reported["position"], T[:3, 3], atol=1e-9)
+        assert np.allclose(matrix_from_quat(np.array(reported["quaternion"])), T[:3, :3], atol=1e-8)
     feed.close()
 
 
@@ -101,13 +101,13 @@ def test_an_agent_publishes_every_pose_that_it_writes(share, app, plain_session,
         "agent", f"{plain_session}/ar1", "--name", "ann", *nobody, "--out", out, "--poses", where(app)
     )
     assert done.code == 1, done.err
-    told = list(waiting(app))
-    assert [one["sequence"] for one in told] == list(range(45))
-    posed = [one for one in told if one["odom"] is not None]
+    reported = list(waiting(app))
+    assert [one["sequence"] for one in reported] == list(range(45))
+    posed = [one for one in reported if one["odom"] is not None]
     written = read_tum(Path(out) / "odom.tum")
     assert [one["stamp_ns"] for one in posed] == written.stamps_ns.tolist()
     assert np.allclose([one["odom"]["position"] for one in posed], written.T[:, :3, 3], atol=1e-8)
     assert all(0 < one["age_ms"] < 5000 for one in posed)
-    assert {one["map"] for one in told} == {None}
-    unknown = [one["state"] for one in told if one["odom"] is None]
+    assert {one["map"] for one in reported} == {None}
+    unknown = [one["state"] for one in reported if one["odom"] is None]
     assert set(unknown) <= {"INITIALISING", "LOST"}

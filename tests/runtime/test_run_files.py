@@ -45,9 +45,9 @@ def test_agents_are_scored_by_the_map_of_their_file(tmp_path):
     elsewhere.T[:, 0, 3] += 8
     (tmp_path / "x.tum").write_text(format_tum(elsewhere))
 
-    def agent(map_tum: str, told: Trajectory) -> AgentScore:
+    def agent(map_tum: str, reported: Trajectory) -> AgentScore:
         report = {"map_tum_id": map_tum, "protocol": {"map_id": "joined/0"}}
-        return AgentScore(report, ate(told, truth), told, truth)
+        return AgentScore(report, ate(reported, truth), reported, truth)
 
     found = largest_map_ate(
         {"ann": agent("a/0", truth), "bob": agent("a/0", truth), "late": agent("b/0", elsewhere)}

@@ -25,7 +25,7 @@ from share.mapping.agents.agreement import AgentStanding
 from share.mapping.mapper import Mapper
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddRun, PeerMessageReceived
-from share.runtime import status_metrics, web
+from share.runtime import status_server, web
 from share.runtime.status_server import CACHE_S, StatusServer
 from share.wire.codec import encode
 from share.wire.messages import peer_id
@@ -87,7 +87,7 @@ def metrics(body):
 
 
 def real_report():
-    """Of an edge that knows one agent and nothing more."""
+    """Return the report of an edge that knows one agent and nothing more."""
     edge, mapper = Edge(Config(), session=5), Mapper(Config())
     hello = hello_of("ann", 1)
     for effect in edge.handle(PeerMessageReceived(peer_id(1), encode(hello)), 10**9):
@@ -178,14 +178,14 @@ def test_metrics_are_read_back():
 def test_metrics_that_the_report_lacks_are_omitted():
     odd = {"agents": {"ann": {"keyframes": "many"}, "bob": None}, "maps": 3, "loops": None, "x_ms": {"n": 0}}
     for report in ({}, odd):
-        body, _ = status_metrics.render_metrics(report)
+        body, _ = status_server.render_metrics(report)
         assert all(value == value for value in metrics(body).values())
 
 
 def test_every_metric_has_a_value_in_a_real_report():
-    body, _ = status_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
+    body, _ = status_server.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
     names = {name for name, _ in metrics(body)}
-    absent = {row.name for row in status_metrics.METRICS} - names
+    absent = {row.name for row in status_server.METRICS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
     not_yet = {
         "share_edge_map_keyframes",
@@ -196,17 +196,17 @@ def test_every_metric_has_a_value_in_a_real_report():
 
 
 def test_names_and_units_are_as_prometheus_wants_them():
-    for row in status_metrics.METRICS:
+    for row in status_server.METRICS:
         assert re.fullmatch(r"share_edge(_[a-z]+)+", row.name)
-        assert row.help.endswith(".") and len({r.name for r in status_metrics.METRICS}) == len(
-            status_metrics.METRICS
+        assert row.help.endswith(".") and len({r.name for r in status_server.METRICS}) == len(
+            status_server.METRICS
         )
 
 
 def test_every_metric_is_in_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "lookup" / "status.md").read_text()
     assert [
-        r.name for r in status_metrics.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
+        r.name for r in status_server.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
     ] == []
 
 
@@ -230,12 +230,12 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_the_page_shows_the_consistency_of_agents():
     """Each field that the page reads is one of the report's."""
-    told = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
-    with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": told}}}) as server:
-        assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == told
+    reported = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
+    with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": reported}}}) as server:
+        assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == reported
         page = get(server, "/")[2].decode()
     assert 'id="consistency"' in page and '["set apart", "disputed"].includes' in page
-    assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= told.keys()
+    assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= reported.keys()
     assert {"reason", "log_scale", "sigma", "put_right"} <= set(re.findall(r"\bc\.(\w+)", page))
 
 
@@ -243,18 +243,18 @@ def test_the_page_shows_the_consistency_of_agents():
 
 
 def test_a_failed_report_is_500_and_reported_once():
-    told = []
+    reported = []
 
     def report():
         raise RuntimeError("the map\nis gone")
 
-    with serving(report, tell=told.append) as server:
+    with serving(report, tell=reported.append) as server:
         answers = [get(server, path) for path in ("/health", "/metrics", "/snapshot.json", "/health")]
         assert get(server, "/")[0] == 200
     assert {(status, body) for status, _, body in answers} == {
         (500, b"no report: RuntimeError: the map is gone\n")
     }
-    assert told == ["status: no report: RuntimeError: the map is gone"]
+    assert reported == ["status: no report: RuntimeError: the map is gone"]
 
 
 def test_a_report_that_is_no_json_is_500():

@@ -49,13 +49,13 @@ def doubles(inbox: Inbox, answer: Callable[[Any], None]) -> None:
 
 
 def test_it_answers_and_ends() -> None:
-    heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    received: queue.SimpleQueue[Any] = queue.SimpleQueue()
     lost: list[str] = []
-    companion = WorkerProcess("doubles", doubles, (), heard.put, lost.append)
+    companion = WorkerProcess("doubles", doubles, (), received.put, lost.append)
     for number in range(100):
         companion.send(number)
     companion.close()
-    assert [heard.get_nowait() for _ in range(100)] == [2 * n for n in range(100)]
+    assert [received.get_nowait() for _ in range(100)] == [2 * n for n in range(100)]
     assert not lost
 
 

@@ -12,7 +12,7 @@ from share.errors import ConfigError
 from share.geometry.camera import Camera
 from share.geometry.se3 import exp, transform
 from share.plain_data import from_mapping
-from share.scheduling.overlap import Frustum, SampledFrustum, ious, overlap_volumes
+from share.scheduling.merge_gate import Frustum, SampledFrustum, ious, overlap_volumes
 from share.types import F64
 
 WIDE = Frustum(math.radians(87), math.radians(58), 0.3, 5.0)

@@ -42,8 +42,7 @@ def settled(plant: Plant, seconds: float = 90) -> dict[str, float]:
 
 
 def test_every_configurable_policy_exists() -> None:
-    assert set(settings.POLICY_NAMES) <= set(POLICIES)
-    assert list(POLICIES) == ["share", "covins-g", "linear", "equal", "random", "streamed"]
+    assert list(POLICIES) == list(settings.POLICY_NAMES)
 
 
 @pytest.mark.parametrize(
@@ -172,9 +171,9 @@ def test_by_attribution_delay_lowers_the_rate_and_error_raises_it() -> None:
 def test_by_attribution_the_base_delay_does_not_lower_the_rate() -> None:
     """A delay of 30 ms at any rate: the rate is then that of the error alone."""
 
-    def last(told: list[tuple[float, float]]) -> float | None:
+    def last(reported: list[tuple[float, float]]) -> float | None:
         policy = made("share", replace(CONFIG, attribution=True))
-        for t, (delay_ms, error_cm) in enumerate(told):
+        for t, (delay_ms, error_cm) in enumerate(reported):
             rate = policy.rate("ann", AgentKind.AR, delay_ms, error_cm, t * S)
         return rate
 

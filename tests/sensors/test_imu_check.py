@@ -189,8 +189,8 @@ def test_frames_lack_rejected_samples_and_count_them() -> None:
     spoiled, counters = bundles(values)
     assert (counters.imu_out_of_range, counters.imu_spikes, counters.imu_samples) == (2, 1, 388)
     assert [b.stamp_ns for b in spoiled] == [b.stamp_ns for b in clean]
-    told = np.concatenate([b.imu.stamps_ns for b in spoiled]) // STEP
-    assert set(range(391)) - set(told.tolist()) == {105, 155, 207}
+    reported = np.concatenate([b.imu.stamps_ns for b in spoiled]) // STEP
+    assert set(range(391)) - set(reported.tolist()) == {105, 155, 207}
 
 
 def test_an_imu_with_rejected_samples_only_is_silent() -> None:

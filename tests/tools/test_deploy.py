@@ -389,7 +389,7 @@ def test_deployment_over_real_ssh(device, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("told", "says"),
+    ("reported", "says"),
     [
         ({"machine": "aarch64"}, "is aarch64, the program was built for x86_64"),
         ({"glibc": 31}, "has glibc 2.31, the program needs 2.36"),
@@ -397,14 +397,14 @@ def test_deployment_over_real_ssh(device, tmp_path):
         ({"systemd": False}, "has no systemd"),
     ],
 )
-def test_unsuitable_device_is_refused_before_the_copy(monkeypatch, told, says):
+def test_unsuitable_device_is_refused_before_the_copy(monkeypatch, reported, says):
     monkeypatch.syspath_prepend(TOOLS)
     tool = importlib.import_module("deploy_device")
     release = importlib.import_module("deploy_release").Release(Path(), "1.0-abc", 300_000_000, "x86_64", 36)
     fine = tool.Facts("x86_64", 36, 10**9, True, "", "", (), "")
     tool.check("headset1", release, fine)
     with pytest.raises(ShareError, match=f"^headset1: {says}"):
-        tool.check("headset1", release, replace(fine, **told))
+        tool.check("headset1", release, replace(fine, **reported))
 
 
 def test_requirements_are_read_from_the_binary(monkeypatch, tmp_path, device):
@@ -415,9 +415,9 @@ def test_requirements_are_read_from_the_binary(monkeypatch, tmp_path, device):
     assert read_release(folder).machine == ""
     library = Path(sys.executable).resolve()
     shutil.copy(library, folder / "python")
-    told = subprocess.run(["objdump", "-T", library], capture_output=True, text=True, check=True).stdout
+    reported = subprocess.run(["objdump", "-T", library], capture_output=True, text=True, check=True).stdout
     found = read_release(folder)
-    assert found.glibc == max(int(minor) for minor in re.findall(r"GLIBC_2\.(\d+)", told))
+    assert found.glibc == max(int(minor) for minor in re.findall(r"GLIBC_2\.(\d+)", reported))
     assert found.machine == platform.machine()
     assert found.name == read_release(folder).name
     (folder / "library.so.1").write_bytes(b"other code")

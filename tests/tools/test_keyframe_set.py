@@ -87,7 +87,7 @@ def test_keyframes_follow_the_spacing(made, every):
 
 
 def test_another_agent_on_the_same_track_sends_other_images(tool, made):
-    """Of the same place: as large, and nearly the same depths."""
+    """Features of the same place: as large, and nearly the same depths."""
     one, other = (list(islice(tool("load_tracks").Walker(made, k).keyframes(), 5)) for k in (0, 2))
     camera = made.agents["ann"].hello.rig.cam0
     sent = {k.stamp_ns: k for k in made.agents["ann"].keyframes}

@@ -34,14 +34,14 @@ def test_session_names_and_motions_are_valid(tools, tmp_path):
 
 
 def test_sessions_are_listed_and_unknown_names_refused():
-    def told(*arguments: str) -> subprocess.CompletedProcess[str]:
+    def reported(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(TOOLS / "make_sessions.py"), *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
-    done = told("--list", "--only", "tumvi-rooms")
+    done = reported("--list", "--only", "tumvi-rooms")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("tumvi-rooms     warehouse, seed 63: ann=tumvi:")
-    done = told("--only", "paper-9", "--out", "x")
+    done = reported("--only", "paper-9", "--out", "x")
     assert done.returncode == 2
     assert "--only paper-9: known are warehouse-1, " in done.stderr
 

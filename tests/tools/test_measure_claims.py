@@ -74,8 +74,8 @@ def honest(tool, seed: int, sure: float):
     return played(tool, seed, tool.Lie(sure=sure))
 
 
-def costs(told, without, error: str) -> list[float]:
-    return [getattr(a, error) / getattr(b, error) for a, b in zip(told, without, strict=True)]
+def costs(reported, without, error: str) -> list[float]:
+    return [getattr(a, error) / getattr(b, error) for a, b in zip(reported, without, strict=True)]
 
 
 def geometric_mean(ratios: list[float]) -> float:
@@ -135,18 +135,18 @@ def test_consistent_agents_are_never_quarantined(tool, seed):
 def test_false_claims_cost_other_agents_little(tool, lie, is_said):
     """Compared with the same rooms without the agent, which helps no other when set apart. An agent that is
     let in has to help as much as one with the same wrong covariance and no other fault."""
-    told = [played(tool, seed, tool.LIES[lie]) for seed in SEEDS]
+    reported = [played(tool, seed, tool.LIES[lie]) for seed in SEEDS]
     without = [alone(tool, seed) for seed in SEEDS]
     for error in ("final", "causal"):
-        ratios = costs(told, without, error)
+        ratios = costs(reported, without, error)
         print(f"{lie}: {error} {geometric_mean(ratios):.3f}, {ratios}")
         assert geometric_mean(ratios) <= COSTS
-    assert {outcome.liar for outcome in told} == {is_said}
-    assert not any(outcome.wronged for outcome in told)
-    assert all(outcome.together is not None for outcome in told)
+    assert {outcome.liar for outcome in reported} == {is_said}
+    assert not any(outcome.wronged for outcome in reported)
+    assert all(outcome.together is not None for outcome in reported)
     if is_said == "agrees":
         right = [honest(tool, seed, tool.LIES[lie].sure) for seed in SEEDS]
-        assert geometric_mean(costs(told, right, "final")) <= COSTS
+        assert geometric_mean(costs(reported, right, "final")) <= COSTS
 
 
 @pytest.mark.slow

@@ -31,9 +31,9 @@ def trial(tool, tmp_path, monkeypatch):
     The edge counts from 10 s before she joined it."""
     stamps_ns = (100 + np.arange(11)) * S
     T = np.tile(np.eye(4), (11, 1, 1))
-    told = T.copy()
-    told[:, 1, 3] = 0.01 * np.arange(11)
-    score = AgentScore({}, None, Trajectory(stamps_ns[5:], told[5:]), Trajectory(stamps_ns, T))
+    reported = T.copy()
+    reported[:, 1, 3] = 0.01 * np.arange(11)
+    score = AgentScore({}, None, Trajectory(stamps_ns[5:], reported[5:]), Trajectory(stamps_ns, T))
     whole = Ate(0.0, 0.0, 0.0, 0.0, 11, np.eye(4))
     monkeypatch.setattr(
         tool, "score_session", lambda *_: SessionScore({"ann": score}, JointAte(whole, {"ann": whole}))

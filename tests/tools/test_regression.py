@@ -95,6 +95,6 @@ def test_history_holds_the_judged_figures(tool):
 @pytest.mark.slow
 def test_no_figure_became_worse():
     """The gate. If it is better or worse for a reason, say so: `python tools/regression.py --keep WHY`."""
-    told = [sys.executable, str(TOOLS / "regression.py")]
-    done = subprocess.run(told, capture_output=True, text=True, timeout=1800)
+    reported = [sys.executable, str(TOOLS / "regression.py")]
+    done = subprocess.run(reported, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -135,10 +135,10 @@ def test_bad_stamps_go_through_the_sequencer(frames):
         for stream, image in ((IMU, (0.0,) * 6), (CAM0, ArrayImage(f.image0)), (CAM1, ArrayImage(f.image1)))
     ]
     arriving = FAULTS["stamps"].change_measurements(measurements)
-    told = {name: [m.stamp_ns for m in arriving if m.stream == name] for name in (CAM0, CAM1, IMU)}
-    assert told[CAM0] == told[CAM1]
-    assert told[IMU] == [f.stamp_ns for f in frames]
-    off = np.array(told[CAM0]) - told[IMU]
+    reported = {name: [m.stamp_ns for m in arriving if m.stream == name] for name in (CAM0, CAM1, IMU)}
+    assert reported[CAM0] == reported[CAM1]
+    assert reported[IMU] == [f.stamp_ns for f in frames]
+    off = np.array(reported[CAM0]) - reported[IMU]
     sorts = (off == -STEP_NS, off == -500_000_000, np.abs(off) == 40_000_000)
     assert all(1 <= wrong.sum() <= 12 for wrong in sorts)  # 2 % of 200 is 4
     assert sum(wrong.sum() for wrong in sorts) == (off != 0).sum()
@@ -163,7 +163,7 @@ def test_a_temporary_fault_affects_both_cameras_for_its_duration(name, lasts, fr
 
 
 def middle(frames, after):
-    """Of what comes for a while."""
+    """Return the frame in the middle of the fault."""
     return after[int(np.searchsorted(seconds(frames), 0.4 * seconds(frames)[-1] + 1.0))]
 
 

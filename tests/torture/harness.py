@@ -213,7 +213,7 @@ class Watch:
                 self.health_failed.append(f"{error}"[:200])
 
     def rss_mb(self, since: float = 0.0) -> tuple[float, float]:
-        """Of all processes together: at `since` (or at first), and the most from then on."""
+        """Return the memory of all processes: at `since` (or at first), and the most from then on."""
         sums = [(s["t"], sum(f["rss_mb"] for f in s["of"].values())) for s in self.samples]
         before = [mb for t, mb in sums if t <= since] or [mb for _, mb in sums[:1]]
         return (before[-1], max(mb for t, mb in sums if t >= min(since, sums[-1][0]))) if sums else (0.0, 0.0)
@@ -341,7 +341,7 @@ def kept_by_run(path: Path) -> dict[tuple[str, int], set[int]]:
 
 
 def kept_ids(path: Path, name: str) -> list[int]:
-    """Of an agent of that name."""
+    """Return the ids of kept keyframes of the agent of that name."""
     return sorted(i for (who, _), ids in kept_by_run(path).items() if who == name for i in ids)
 
 

@@ -57,7 +57,7 @@ def test_matching_is_symmetric_and_rejects_unlike_descriptors() -> None:
 
 
 def test_mutual_pairs_are_the_best_of_row_and_column() -> None:
-    """Of equals the first; the most similar come first."""
+    """The first of equals; the most similar come first."""
     distance = np.array([[9, 3, 9], [2, 1, 9], [9, 9, 5], [9, 9, 5]], np.uint16)
     found = mutual_best(pairs_within(distance, 8))
     assert [tuple(map(int, pair)) for pair in zip(*found, strict=True)] == [(1, 1, 1), (2, 2, 5)]

@@ -42,7 +42,7 @@ HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Of N keyframes: seconds; error_cm; estimate (N, 3): expected, low and high, cm; strange (N,)."""
+    """N keyframes: seconds; error_cm; estimate (N, 3): expected, low and high, cm; strange (N,)."""
 
     name: str
     seconds: F64

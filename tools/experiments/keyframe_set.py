@@ -92,7 +92,7 @@ class AgentKeyframes:
 @dataclass(frozen=True, eq=False)
 class KeyframeSet:
     """agents: by name. size: of the room (x, y, z) m, which
-    `share.lab.emulate.world.scenes.corridor.twin_corridors` needs."""
+    `share.lab.emulate.world.scenes.hard_rooms.twin_corridors` needs."""
 
     recipe: SessionRecipe
     every: Spacing

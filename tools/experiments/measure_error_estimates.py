@@ -50,7 +50,7 @@ HEAD = (
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Of one agent in one run, at N evaluations. estimated_cm, true_cm: estimated and true errors (N,)."""
+    """One agent in one run, at N evaluations. estimated_cm, true_cm: estimated and true errors (N,)."""
 
     kind: str
     estimated_cm: F64

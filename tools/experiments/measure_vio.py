@@ -50,7 +50,7 @@ COLUMNS = (
     _Column("RPE 1 s cm", "rpe_1s_cm", ".2f"),
     _Column("RPE 1 s °", "rpe_1s_deg", ".3f"),
     _Column("OK %", "OK", ".1f", 100, min),
-    _Column("with a pose %", "told", ".1f", 100, min),
+    _Column("with a pose %", "with_pose", ".1f", 100, min),
     _Column("LOST s", "lost_s", ".1f"),
     _Column("new segments", "new_stretches", ".0f"),
     _Column("ready s", "init_s", ".2f"),

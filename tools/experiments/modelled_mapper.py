@@ -28,8 +28,7 @@ from share.mapping.map_changes import MapChange
 from share.mapping.query_queue import CandidateSearch, QueryQueue, service_kind
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.segments import MIN_LOOP_GAP
-from share.scheduling.merge_gate import MergeGate
-from share.scheduling.overlap import Frustum, SampledFrustum, overlap_volumes
+from share.scheduling.merge_gate import Frustum, MergeGate, SampledFrustum, overlap_volumes
 from share.types import F64, Correction, Keyframe
 from share.wire.messages import Hello
 

@@ -13,7 +13,7 @@ from keyframe_set import KeyframeSet, Spacing, keyframe_set
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.lab.emulate.recipe import SessionRecipe
-from share.lab.emulate.world.scenes.corridor import twin_corridors
+from share.lab.emulate.world.scenes.hard_rooms import twin_corridors
 from share.mapping.recognition import verification
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
@@ -101,7 +101,7 @@ LOOSE_LIMITS = {"MIN_INLIERS": 8, "MIN_DIRECTION_INLIERS": 4, "MAX_SIGMA_DEG": 3
 
 
 class Tried(NamedTuple):
-    """Of every pair, (M,): true match; accepted by loose limits; pose right, or right for the twin; inliers;
+    """Every pair, (M,): true match; accepted by loose limits; pose right, or right for the twin; inliers;
     sigma [deg]; number of pairs that it stands for."""
 
     true: F64

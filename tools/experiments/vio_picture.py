@@ -17,7 +17,7 @@ _BEGINNING_S, _ROOM = 10.0, 1.08  # the scale is that of later errors, with a ma
 
 
 class Curves(NamedTuple):
-    """Of one run: t_s (N,) since its first frame; errors and sigmas (N, 6) rad, then m; segment (N,)."""
+    """One run: t_s (N,) since its first frame; errors and sigmas (N, 6) rad, then m; segment (N,)."""
 
     label: str
     t_s: F64

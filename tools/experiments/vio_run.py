@@ -32,7 +32,7 @@ ACCURACY = (
 
 @dataclass
 class TrackedRun:
-    """Of the frames with a pose: stamps, published poses, the filter's poses (z up as known then) and their
+    """The frames with a pose: stamps, published poses, the filter's poses (z up as known then) and their
     covariances, index of the unbroken segment. CPU ms of every frame and of every keyframe."""
 
     stamps: list[int] = field(default_factory=list)
@@ -62,7 +62,7 @@ class TrackedRun:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Of the frames with a pose and ground truth: stamps (N,), segment (N,), deviations."""
+    """The frames with a pose and ground truth: stamps (N,), segment (N,), deviations."""
 
     stamps_ns: I64
     segment: I64
@@ -103,7 +103,7 @@ def figures(source: Source, run: TrackedRun, found: Series) -> dict[str, Any]:
     report, frames = run.log.report(), run.log.frames()
     return {
         "frames": report["frames"],
-        "told": report["tracked"] / report["frames"],
+        "with_pose": report["tracked"] / report["frames"],
         "with_truth": len(found.stamps_ns),
         **accuracy(source, run, found),
         "states": {str(state): int(frames.in_state(state).sum()) / len(frames) for state in TrackState},

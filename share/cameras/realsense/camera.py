@@ -13,8 +13,15 @@ from typing import Any
 from share.cameras.feed import CameraFeed
 from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
 from share.cameras.realsense.devices import choose_device, list_devices, load_sdk, parse_serial, sdk_errors
-from share.cameras.realsense.sdk_data import factory_rig, has_dots, to_sample
-from share.cameras.realsense.streams import OpenedSensor, StreamRequest, choose_streams, stream_rates_hz
+from share.cameras.realsense.streams import (
+    OpenedSensor,
+    StreamRequest,
+    choose_streams,
+    factory_rig,
+    has_dots,
+    stream_rates_hz,
+    to_sample,
+)
 from share.cameras.sample_queue import NewestImageQueue, SampleQueue
 from share.errors import ShareError
 from share.geometry.camera import Rig

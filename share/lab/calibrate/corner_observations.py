@@ -44,7 +44,7 @@ class Corners:
 
 @dataclass(frozen=True, eq=False)
 class CornerObservations:
-    """Of each camera its model, T_cam_cam0 and the corners that it sees in F frames."""
+    """Each camera's model, T_cam_cam0 and the corners that it sees in F frames."""
 
     frames: int
     cameras: tuple[Camera, ...]

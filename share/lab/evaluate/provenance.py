@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import share
-from share.runtime.machine import core_count
+from share.devices.host import core_count
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "pyzmq", "scipy")
 _DIGEST_DIGITS = 10

@@ -1,1 +1,1 @@
-"""Do the agents agree with each other? Pairs are compared by their loops; who contradicts is quarantined."""
+"""Do the agents agree? Pairs are compared by their loops; an agent that contradicts others is quarantined."""

@@ -68,7 +68,7 @@ AgentNames = tuple[str, str]
 class AgentAgreement:
     """Agreement of all agents, which are given by their runs.
 
-    quarantined: agents that must not affect others. disputed: pairs in which it is undetermined who is
+    quarantined: agents that must not affect others. disputed: pairs in which it is undetermined which is
     wrong. log_scales: log of how much too long each agent's metres are, where significant; else missing.
     pairs: comparisons of every two agents with loops, by their names.
     """

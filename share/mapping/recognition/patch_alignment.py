@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from share.geometry import se3
-from share.geometry.camera import Camera, rays
+from share.geometry.camera import Camera, project, rays
 from share.mapping.recognition.depth_scale import DepthScale
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import F32, F64, I64, U8, KeyframeImage, View
@@ -45,7 +45,6 @@ _CONVERGED_STEP = 3e-4  # rad and m, at full size
 _MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = 1e-3, 1.0
 _MIN_RHO = 1e-6  # 1/m
 _NOT_VISIBLE = 1e3  # whitened residual of what the pose puts behind the camera
-_MIN_DEPTH_RATIO = 0.02  # of the depth in the other camera: nearer counts as behind it
 _RIDGE = 1e-6
 # Added to the covariance: errors that many patches do not average out (calibration, shutter, the JPEG).
 _FLOOR_DEG, _FLOOR_M = 0.02, 0.001
@@ -239,12 +238,7 @@ def _transfer(
     ray, plane = rays(source.uv[index]), source.plane[index]
     rho = np.exp(log_scale) * (ray * plane).sum(axis=1)
     q = ray @ T[:3, :3].T + rho[:, None] * T[:3, 3]
-    z = np.where(q[:, 2] > _MIN_DEPTH_RATIO, q[:, 2], np.nan)
-    uv = q[:, :2] / z[:, None]
-    D = np.zeros((len(q), 2, 3))
-    D[:, 0, 0] = D[:, 1, 1] = 1 / z
-    D[:, :, 2] = -uv / z[:, None]
-    return uv, D, q, rho
+    return *project(q), q, rho
 
 
 def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignment:

@@ -44,8 +44,8 @@ def test_cameras_are_found_on_the_imu(name: str, seed: int) -> None:
     xi = se3.log(se3.inverse(found.T_imu_cam0) @ rig.T_body_cam0)
     error = np.append(xi, SHIFT_S - found.shift_s)
     nees = error @ np.linalg.solve(found.covariance, error)
-    told = np.degrees(np.linalg.norm(xi[:3])), np.linalg.norm(xi[3:]) * 1e3, error[6] * 1e3, nees
-    print(name, seed, "deg, mm, ms, NEES:", *(f"{x:.4f}" for x in told))
+    reported = np.degrees(np.linalg.norm(xi[:3])), np.linalg.norm(xi[3:]) * 1e3, error[6] * 1e3, nees
+    print(name, seed, "deg, mm, ms, NEES:", *(f"{x:.4f}" for x in reported))
     assert judge_camera_imu(found).passed, judge_camera_imu(found).reasons
-    assert told[0] < 0.1 and told[1] < 2 and abs(told[2]) < 0.2
+    assert reported[0] < 0.1 and reported[1] < 2 and abs(reported[2]) < 0.2
     assert nees < 24.3  # chi-square of 7: 0.1 %

@@ -62,6 +62,6 @@ def test_a_fisheye_pair_is_tracked(tmp_path):
     recipe = SessionRecipe("warehouse", ("a=walk:",), seconds=6.0, seed=11, profiles={"": "tumvi"})
     session = make_session(recipe, tmp_path / "session")
     done = CliRunner().invoke(cli, ["track", str(session / "a"), "--json"], catch_exceptions=False)
-    told = json.loads(done.stdout)
-    assert told["tracked"] > 100 and told["lost_s"] == 0
-    assert told["ate_m"] < 0.006
+    reported = json.loads(done.stdout)
+    assert reported["tracked"] > 100 and reported["lost_s"] == 0
+    assert reported["ate_m"] < 0.006

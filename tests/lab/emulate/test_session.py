@@ -126,10 +126,10 @@ def test_calibration_is_the_rig(whole, small):
 
 
 def test_provenance_holds_the_recipe(whole, recipe):
-    told = read_session(whole).provenance
-    assert told["generator"] == "share emulate"
-    assert {key: told[key] for key in recipe.to_mapping()} == recipe.to_mapping()
-    assert told["seed"] == 5
+    reported = read_session(whole).provenance
+    assert reported["generator"] == "share emulate"
+    assert {key: reported[key] for key in recipe.to_mapping()} == recipe.to_mapping()
+    assert reported["seed"] == 5
 
 
 # ------------------------------------------------------------------ same recipe, same bytes

@@ -46,9 +46,9 @@ def test_two_facing_agents_see_each_other(small, tmp_path):
         times = np.arange(actor.path.start_ns, actor.path.end_ns, 10**8)
         when, at, ahead = nearest_view(stage, who, other, times)
         assert ahead > 0.9
-        (sight,) = stage.views(who, np.array([when]))
-        assert list(sight.part_poses) == [stage.actors[other].name]
-        seen = sight.camera_view(T_body_camera(actor.rig, "cam0"))
+        (view,) = stage.views(who, np.array([when]))
+        assert list(view.part_poses) == [stage.actors[other].name]
+        seen = view.camera_view(T_body_camera(actor.rig, "cam0"))
         alone = type(seen)(seen.T_world_cam)
         camera = actor.rig.cam0
         difference = np.abs(renderer.radiance(camera, [seen]) - renderer.radiance(camera, [alone]))

@@ -35,7 +35,7 @@ def test_pairs_with_a_missing_value_are_left_out(rng):
 
 @pytest.mark.long
 def test_the_interval_covers_the_mean_at_its_level():
-    """Of 20 normal values; percentiles of so few are known to be a little narrow."""
+    """With 20 normal values; percentiles of so few are known to be a little narrow."""
     inside = 0
     for seed in range(400):
         rng = np.random.default_rng(seed)

@@ -65,7 +65,7 @@ def test_lost_packets_arrive_late() -> None:
 
 
 def test_bursts_keep_the_loss_rate() -> None:
-    """Of large messages as many packets are lost, but fewer messages are late."""
+    """Large messages lose as many packets, but fewer of them are late."""
     single, bursts = (
         arrivals(ChannelModel(loss=0.02, burst=b), [14_000] * 8_000, every_ms=10_000.0) > 0
         for b in (1.0, 5.0)

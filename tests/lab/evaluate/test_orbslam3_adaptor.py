@@ -36,7 +36,7 @@ def source(tmp_path):
 
 
 @pytest.fixture
-def told(source, tmp_path):
+def reported(source, tmp_path):
     """What the adaptor makes of the recording."""
     return answered(tmp_path, rig_calibration(source), peer_frames(source))
 
@@ -54,8 +54,8 @@ def answered(tmp_path, rig, what):
     return json.loads(done.stdout)
 
 
-def test_settings_are_the_recordings(told, source):
-    read = cv2.FileStorage(told["settings"], cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+def test_settings_are_the_recordings(reported, source):
+    read = cv2.FileStorage(reported["settings"], cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     rig = source.rig
     assert read.getNode("Camera.type").string() == "PinHole"
     assert read.getNode("Camera.width").real() == rig.cam0.width
@@ -88,11 +88,11 @@ def test_a_fifth_coefficient_is_passed_on(source, tmp_path):
     assert read.getNode("Camera2.k3").empty()
 
 
-def test_each_frame_has_the_samples_since_the_one_before(told, source):
+def test_each_frame_has_the_samples_since_the_one_before(reported, source):
     stamps = [moment.stamp_ns for moment in peer_frames(source)]
     recorded = [m.stamp_ns for m in source.measurements() if m.stream == "imu"]
     before = 0
-    for stamp, taken in zip(stamps, told["taken"], strict=True):
+    for stamp, taken in zip(stamps, reported["taken"], strict=True):
         wanted = [1e-9 * ns for ns in recorded if before < ns <= stamp]
         assert taken == pytest.approx(wanted, abs=1e-6)
         before = stamp

@@ -37,7 +37,7 @@ def track_ms(room: Simulation, name: str) -> list[float]:
 
 
 def corrected_ms(room: Simulation, name: str) -> list[float]:
-    """Of the frames that were corrected."""
+    """Return those of the frames that were corrected."""
     late = room.logs[name].frames().corrected_ms.tolist()
     return [ms for ms in late if not np.isnan(ms)]
 

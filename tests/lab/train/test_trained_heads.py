@@ -35,7 +35,7 @@ def test_the_margin_gives_intervals_their_stated_coverage(rng):
 
 
 def test_the_margin_of_few_errors_is_the_largest():
-    """Of nine errors: nothing smaller covers nine of ten."""
+    """With nine errors: nothing smaller covers nine of ten."""
     y = np.arange(9.0)
     assert conformal_margin(np.zeros((9, 3)), y) == 8
 

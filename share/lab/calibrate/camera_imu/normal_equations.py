@@ -40,7 +40,7 @@ class Sigmas:
 
 @dataclass(frozen=True, eq=False)
 class SegmentNormals:
-    """Of S segments H (S, L, L) and g (S, L) by local columns, and the total cost."""
+    """Normal equations of S segments, H (S, L, L) and g (S, L) by local columns, and the total cost."""
 
     H: F64
     g: F64

@@ -28,7 +28,7 @@ from share.lab.mocap.state import MocapFitOptions
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.recordings import tables
 from share.recordings.calibration import CAMCHAIN, IMU_CHAIN, imu_noise, kalibr_T_imu_cam
-from share.recordings.euroc import TRUTH_FOLDERS
+from share.recordings.folders import TRUTH_FOLDERS
 from share.types import F64, I64, ImuBatch
 
 

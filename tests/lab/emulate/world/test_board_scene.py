@@ -14,7 +14,7 @@ TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 
 
 def tiles(target):
-    """Of each tile its picture, the place (2,) m of the picture's upper left corner, and m a texel."""
+    """Return of each tile its picture, the place (2,) m of the picture's upper left corner, and m a texel."""
     shape, _ = printed_sheet(target)
     mesh, out = shape.mesh, []
     for k, material in enumerate(shape.materials):

@@ -11,7 +11,7 @@ from scipy.ndimage import label
 from share.errors import UsageError
 from share.lab.emulate.world.layout import Layout, Piece
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.emulate.world.scenes import SCENES, corridor, make_scene_layout
+from share.lab.emulate.world.scenes import SCENES, hard_rooms, make_scene_layout
 from share.types import F64
 
 pytestmark = pytest.mark.long
@@ -87,7 +87,7 @@ def test_nothing_floats(name: str) -> None:
         x, y, z = room.size
         walls = [(0, 0), (0, x), (1, 0), (1, y)]
         if name == "corridor-twins":
-            wide, end = corridor.corridor_widths(room.size)
+            wide, end = hard_rooms.corridor_widths(room.size)
             walls += [(0, end), (0, x - end), (1, wide), (1, y - wide)]
         for piece in room.pieces:
             low, high = piece.bounding_box[:, 2]
@@ -138,7 +138,7 @@ def test_the_two_corridors_look_alike(size: tuple[float, float, float] | None) -
     """Every thing in the north corridor has its like in the south one, but for a few small ones."""
     for seed in range(4):
         room = make_scene_layout("corridor-twins", seed, size) if size else rooms("corridor-twins")[seed]
-        north, south, T = corridor.twin_corridors(room.size)
+        north, south, T = hard_rooms.twin_corridors(room.size)
         there, here = (contents(room, area) for area in (north, south))
         assert len(there) > 5
         unlike = [b for b in there if min_distance(turned(b, T), here) > 1e-3]
@@ -149,7 +149,7 @@ def test_the_two_corridors_look_alike(size: tuple[float, float, float] | None) -
 
 def test_the_ends_of_the_corridors_differ() -> None:
     room = make_scene_layout("corridor-twins", 0)
-    (_, T), (wide, end) = corridor.twin_corridors(room.size)[1:], corridor.corridor_widths(room.size)
+    (_, T), (wide, end) = hard_rooms.twin_corridors(room.size)[1:], hard_rooms.corridor_widths(room.size)
     x, y, _ = room.size
     west, east = (contents(room, np.array([(a, wide), (a + end, y - wide)])) for a in (0.0, x - end))
     assert max(min_distance(turned(b, T), east) for b in west) > 0.1

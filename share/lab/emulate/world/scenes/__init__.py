@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from share.errors import UsageError
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.scenes.board import april_grid_scene, charuco_scene
-from share.lab.emulate.world.scenes.corridor import corridor_twins
 from share.lab.emulate.world.scenes.firestation import firestation
+from share.lab.emulate.world.scenes.hard_rooms import corridor_twins, whitewall
 from share.lab.emulate.world.scenes.layout_builder import Size
 from share.lab.emulate.world.scenes.warehouse import warehouse
-from share.lab.emulate.world.scenes.whitewall import whitewall
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from share.runtime.machine import free_memory_bytes
+from share.devices.host import free_memory_bytes
 
 GB = 1_000_000_000
 
