@@ -60,14 +60,23 @@ def load_read_only(path: Path) -> StoredMap:
         return _with_complaint(salvaged, "the file is damaged; only intact rows were read")
 
 
-def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
-    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables."""
+_UNDATED = "SELECT run, id FROM keyframe WHERE (run, id) NOT IN (SELECT run, id FROM arrival) ORDER BY number"
+
+
+def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
+    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables.
+
+    Keyframes of an older schema, and those whose time of arrival was lost, count as arrived at now_s (unix
+    s)."""
     with translate_errors(path, "opened"):
         connection = database.open_for_writing(path, durable)
+        connection.execute("BEGIN IMMEDIATE")
         if schema.is_empty(connection):
-            connection.execute("BEGIN IMMEDIATE")
             schema.create(connection)
-            connection.execute("COMMIT")
+        schema.convert(connection)
+        for run, id in connection.execute(_UNDATED).fetchall():
+            rows.insert(connection, "arrival", rows.arrival_row(KeyframeKey(run, id), now_s))
+        connection.execute("COMMIT")
     return connection
 
 
@@ -79,11 +88,15 @@ def _check_schema(path: Path) -> None:
         version = schema.read_version(connection)
     if version is None:
         raise DamageError(f"{path}: the map is damaged: its schema number is unreadable")
-    if version != schema.SCHEMA:
-        age = "a newer" if version > schema.SCHEMA else "an older"
+    if version > schema.SCHEMA:
         raise UsageError(
-            f"{path}: was made by {age} SHARE (schema {version}, this one reads {schema.SCHEMA}); "
+            f"{path}: was made by a newer SHARE (schema {version}, this one reads {schema.SCHEMA}); "
             "use that SHARE, or give another file"
+        )
+    if version < schema.OLDEST_SCHEMA:
+        raise UsageError(
+            f"{path}: was made before SHARE 0.1.0 (schema {version}), and no release reads it; "
+            "give another file: the agents build the map anew"
         )
 
 
@@ -124,8 +137,10 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     links, lost_links = _decode_rows(read_rows, "link", rows.read_link)
     loops, lost_loops = _decode_rows(read_rows, "loop", rows.read_loop)
     poses, lost_poses = _decode_rows(read_rows, "poses", rows.read_poses)
+    arrivals = dict(_decode_rows(read_rows, "arrival", rows.read_arrival)[0])
     repaired = repair_references(
-        [k for k in keyframes if k.run_key in runs], {link.key: link for link in links}
+        [replace(k, came_s=arrivals.get(k.keyframe_key)) for k in keyframes if k.run_key in runs],
+        {link.key: link for link in links},
     )
     known_keys = {k.keyframe_key for k in repaired.keyframes}
     connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)

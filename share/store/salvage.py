@@ -27,6 +27,7 @@ from share.store.schema import PAGE_BYTES, own_tables
 _DELETE_ORPHANS = (
     "DELETE FROM keyframe WHERE run NOT IN (SELECT key FROM run)",
     "DELETE FROM link WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
+    "DELETE FROM arrival WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
     "DELETE FROM loop WHERE (a_run, a_id) NOT IN (SELECT run, id FROM keyframe)"
     " OR (b_run, b_id) NOT IN (SELECT run, id FROM keyframe)",
 )
@@ -71,6 +72,7 @@ def salvage(path: Path) -> tuple[ReadRows, Path]:
     read_rows = merge_run_copies(read_damaged(path, path.parent))
     part = path.with_name(path.name + ".salvaged.part")
     part.unlink(missing_ok=True)
+    database.create_private(part)
     with database.translate_errors(part, "written"), write_errors(part):
         _write_rows(read_rows, part)
         part.replace(_salvaged_path(path))
@@ -92,6 +94,7 @@ def finish_salvage(path: Path) -> Path:
 def set_aside(path: Path) -> Path:
     """Rename a map that is not open, and its log. Return the new name. Raises ShareError."""
     renamed = _free_name(path)
+    database.make_private(path)
     with write_errors(path):
         for old, new in ((wal_path(path), wal_path(renamed)), (path, renamed)):
             if old.exists():
@@ -166,6 +169,9 @@ def read_intact_rows(connection: sqlite3.Connection) -> ReadRows:
     """Read all rows of our own tables that are readable and have a correct CRC; count the others."""
     read_rows, own = ReadRows(), _own_tables(connection)
     for table in COLUMNS:
+        if table in schema.ADDED_TABLES and table not in own:  # the file is of an older schema
+            read_rows.tables[table] = []
+            continue
         table_rows, all_read = _read_table(connection, table) if table in own else ({}, False)
         intact = {n: row for n, row in table_rows.items() if is_intact(table, n, row)}
         read_rows.tables[table] = [(n, row[:-1]) for n, row in sorted(intact.items())]

@@ -1,7 +1,8 @@
 """The tables of a map file, and its schema number.
 
 Every row ends in a CRC-32 of its table's name and its other columns, so each can be checked alone. The table
-`about` is the same in all schemas: it holds the schema number.
+`about` is the same in all schemas: it holds the schema number. A newer schema only adds tables, so an older
+file is converted by creating them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import sqlite3
 from share import __version__
 from share.store.rows import insert, is_intact
 
-SCHEMA = 3
+SCHEMA = 4
+OLDEST_SCHEMA = 3  # that can be converted: SHARE 0.1.0's; 1 and 2 were never released
 PAGE_BYTES = 8192
 
 TABLES = """
@@ -29,15 +31,35 @@ CREATE INDEX loop_a ON loop(a_run, a_id);
 CREATE INDEX loop_b ON loop(b_run, b_id);
 CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc INTEGER)
 """  # noqa: E501
-STATEMENTS = tuple(TABLES.strip().split(";\n"))
+_ADDED = {  # by schema; last in the file, so that page 1 of an older file differs in nothing else
+    4: "CREATE TABLE arrival(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, unix_s INTEGER, crc INTEGER,"
+    " UNIQUE(run, id))",
+}
+ADDED_TABLES = ("arrival",)  # which an older file lacks
 
 
-def create(connection: sqlite3.Connection) -> None:
+def _statements(version: int) -> list[str]:
+    added = [statement for number, statement in _ADDED.items() if number <= version]
+    return [*TABLES.strip().split(";\n"), *added]
+
+
+def create(connection: sqlite3.Connection, version: int = SCHEMA) -> None:
     """Create all tables, within an open transaction."""
-    for statement in STATEMENTS:
+    for statement in _statements(version):
         connection.execute(statement)
-    for name, value in (("schema", str(SCHEMA)), ("made by", f"SHARE {__version__}")):
+    for name, value in (("schema", str(version)), ("made by", f"SHARE {__version__}")):
         insert(connection, "about", (name, value))
+
+
+def convert(connection: sqlite3.Connection) -> None:
+    """Add what an intact file of an older schema lacks, within an open transaction."""
+    version = read_version(connection) or OLDEST_SCHEMA
+    for statement in _statements(SCHEMA)[len(_statements(version)) :]:
+        connection.execute(statement)
+    if version != SCHEMA:
+        (number,) = connection.execute("SELECT number FROM about WHERE name = 'schema'").fetchone()
+        connection.execute("DELETE FROM about WHERE number = ?", (number,))
+        insert(connection, "about", ("schema", str(SCHEMA)), number)
 
 
 def read_version(connection: sqlite3.Connection) -> int | None:
@@ -52,8 +74,9 @@ def read_version(connection: sqlite3.Connection) -> int | None:
 
 
 def matches_schema(connection: sqlite3.Connection) -> bool:
-    """Return whether tables and indexes are exactly those of this schema."""
-    return _objects(connection) == _objects(_template())
+    """Return whether tables and indexes are exactly those of the file's own schema."""
+    version = read_version(connection)
+    return version is not None and _objects(connection) == _objects(_template(version))
 
 
 def own_tables(connection: sqlite3.Connection) -> set[str]:
@@ -76,10 +99,10 @@ def first_page() -> bytes:
     return bytes(page)
 
 
-def _template() -> sqlite3.Connection:
+def _template(version: int = SCHEMA) -> sqlite3.Connection:
     connection = sqlite3.connect(":memory:", isolation_level=None)
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
-    create(connection)
+    create(connection, version)
     return connection
 
 
