@@ -20,12 +20,17 @@ COMMANDS = {
     "dataset": (
         "share.cli.dataset",
         "dataset",
-        "Inspect, convert, recover and align recordings; export maps.",
+        "Inspect, convert, recover and align recordings; export maps, delete from them.",
     ),
     "dataset align": (
         "share.cli.dataset_align",
         "align",
         "Make a session of field recordings and a motion capture.",
+    ),
+    "dataset forget": (
+        "share.cli.dataset_forget",
+        "forget",
+        "Delete agents, or what is old, from a map for good.",
     ),
     "sync": ("share.cli.sync", "sync", "Give all machines of a room one clock, and check it."),
     "doctor": ("share.cli.doctor", "doctor", "Check this device, and say how to fix what is missing."),

@@ -1,4 +1,4 @@
-"""`share dataset`: inspect, convert, recover and align recordings; inspect and export maps."""
+"""`share dataset`: inspect, convert, recover and align recordings; inspect, export and prune maps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from share.errors import UsageError
 
 @click.group(cls=CommandGroup, prefix="dataset ")
 def dataset() -> None:
-    """Inspect, convert, recover and align recordings; inspect and export maps.
+    """Inspect, convert, recover and align recordings; inspect maps, export them, delete agents from them.
 
     \b
     Example:  share dataset info rec/kitchen
@@ -209,7 +209,7 @@ def _camera_text(camera: dict[str, Any]) -> str:
 
 
 def _map_text(d: dict[str, Any]) -> str:
-    lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
+    lines = [f"{d['name']}: map, schema {d['schema'] or '?'}, {d['bytes'] / 1e6:.1f} MB"]
     for name, agent in d["agents"].items():
         removed = agent["next_keyframe"] - agent["keyframes"]
         segments_text = f", {agent['segments']} segments" if agent["segments"] > 1 else ""

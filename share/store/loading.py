@@ -76,14 +76,22 @@ def _opened(read_rows: ReadRows) -> OpenedMap:
     return OpenedMap(read_rows, outline_map(read_rows).problems)
 
 
-def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
-    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables."""
+_UNDATED = "SELECT run, id FROM keyframe WHERE (run, id) NOT IN (SELECT run, id FROM arrival) ORDER BY number"
+
+
+def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
+    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables.
+
+    Keyframes of an older schema, and those whose time of arrival was lost, count as arrived at now_s (unix
+    s)."""
     with translate_errors(path, "opened"):
         connection = database.open_for_writing(path, durable)
         connection.execute("BEGIN IMMEDIATE")
         if schema.is_empty(connection):
             schema.create(connection)
         schema.convert(connection)
+        for run, id in connection.execute(_UNDATED).fetchall():
+            rows.insert(connection, "arrival", rows.arrival_row(KeyframeKey(run, id), now_s))
         connection.execute("COMMIT")
     return connection
 
@@ -126,7 +134,7 @@ def _read_intact(path: Path) -> ReadRows:
             (verdict,) = connection.execute(f"PRAGMA integrity_check({table})").fetchone()
             if verdict != "ok":
                 raise DamageError(f"{path}: the map is damaged: {verdict}")
-        read_rows = read_intact_rows(connection, [table for table in rows.COLUMNS if table in tables])
+        read_rows = read_intact_rows(connection, [t for t in rows.COLUMNS if t not in schema.LARGE_TABLES])
     if read_rows.is_damaged:
         raise DamageError(f"{path}: the map is damaged: its rows")
     return read_rows
@@ -190,8 +198,10 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     links, lost_links = _decode_rows(read_rows, "link", rows.read_link)
     loops, lost_loops = _decode_rows(read_rows, "loop", rows.read_loop)
     poses, lost_poses = _decode_rows(read_rows, "poses", rows.read_poses)
+    arrivals = dict(_decode_rows(read_rows, "arrival", rows.read_arrival)[0])
     repaired = repair_references(
-        [k for k in keyframes if k.run_key in runs], {link.key: link for link in links}
+        [replace(k, came_s=arrivals.get(k.keyframe_key)) for k in keyframes if k.run_key in runs],
+        {link.key: link for link in links},
     )
     known_keys = {k.keyframe_key for k in repaired.keyframes}
     connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)

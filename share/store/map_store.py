@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from share.mapping.map_changes import (
     SaveRun,
     SaveView,
     StoredMap,
+    Wipe,
 )
 from share.store import database, rows, schema
 from share.store.database import DamageError, is_map, why_not_written
@@ -59,19 +61,31 @@ class MapStore:
         self._file_ids: dict[Path, tuple[int, int]] = {}  # device and inode of the map's files
         self._lock: int | None = None
         self._durable = False
+        self._is_wiping = False  # the log still has what a `Wipe` demands to be gone
 
     @property
     def writable(self) -> bool:
         return self._db is not None
 
+    @property
+    def schema(self) -> int | None:
+        """The file's schema number; None if it cannot be read."""
+        try:
+            with contextlib.closing(database.open_for_reading(self.path)) as connection:
+                return schema.read_version(connection)
+        except database.DAMAGE_ERRORS:
+            return None
+
     @staticmethod
     def open(path: Path, durable: bool = False) -> MapStore:
-        """Open the map at `path`, or create it; all of it but images and views is read and checked.
+        """Open the map at `path`, or create it; all of it but images and views is read and checked. Only its
+        owner may read it.
 
-        Of a damaged file all intact rows are taken over, and it is kept as FILE.damaged-N. A file that may
-        not be written is opened for reading. durable: commits wait for the disk, so that a power failure
-        loses none. Raises UsageError if it is no map, or of another schema; StoreError if another edge uses
-        it; ShareError if the disk is full or fails. The file is then unchanged.
+        Of a damaged file all intact rows are taken over, and it is kept as FILE.damaged-N. One of an older
+        schema is converted. One that may not be written is opened for reading. durable: commits wait for the
+        disk, so that a power failure loses none. Raises UsageError if it is no map, or of another schema;
+        StoreError if another edge uses it; ShareError if the disk is full or fails. The file is then
+        unchanged.
         """
         path = path.resolve() if path.is_symlink() else path
         if path.is_dir():
@@ -84,7 +98,8 @@ class MapStore:
         lock = database.lock_map(path)
         try:
             store = MapStore(path, read_and_repair(path), "")
-            store._db, store._lock = open_writer(path, durable), lock
+            database.create_private(path)
+            store._db, store._lock = open_writer(path, durable, time.time()), lock
             store._file_ids, store._durable = _read_file_ids(path), durable
             return store
         except BaseException:
@@ -115,16 +130,17 @@ class MapStore:
         try:
             db.execute("BEGIN IMMEDIATE")
             for change in new_changes:
-                apply_change(db, change)
+                apply_change(db, change, time.time())
             db.execute("COMMIT")
         except BaseException as error:
             with contextlib.suppress(sqlite3.Error):  # on a full disk SQLite has rolled back by itself
                 db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
-                kind = DamageError if database.is_damage(error) else StoreError
-                why = why_not_written(error, self.path)
-                raise kind(f"{self.path}: the map cannot be written: {why}") from None
+                raise self._write_error(error) from None
             raise
+        self._is_wiping |= any(isinstance(change, Wipe) for change in new_changes)
+        if self._is_wiping:
+            self._is_wiping = not self._empty_log()
         self._check_in_place()
 
     def _repair(self) -> None:
@@ -135,8 +151,30 @@ class MapStore:
             self.problems = (*self.problems, damage_text(renamed))
         finally:
             self._opened = None
-            self._db = open_writer(self.path, self._durable)
+            database.create_private(self.path)
+            self._db = open_writer(self.path, self._durable, time.time())
             self._file_ids = _read_file_ids(self.path)
+
+    def compact(self) -> None:
+        """Rewrite the file without what was removed, and empty its log. Raises StoreError if the disk is full
+        or fails, or another program reads the file: then all of the map is still there."""
+        db = self._writable_db()
+        self._check_in_place()
+        try:
+            db.execute("VACUUM")
+        except sqlite3.Error as error:
+            raise self._write_error(error) from None
+        if not self._empty_log():
+            raise StoreError(f"{self.path}: another program reads the map; end it and repeat the command")
+
+    def _empty_log(self) -> bool:
+        """Write the log back to the file and cut it to nothing. Return whether no reader prevented it."""
+        is_busy, _, _ = _first_row(self._writable_db(), "PRAGMA wal_checkpoint(TRUNCATE)")
+        return not is_busy
+
+    def _write_error(self, error: sqlite3.Error) -> StoreError:
+        kind = DamageError if database.is_damage(error) else StoreError
+        return kind(f"{self.path}: the map cannot be written: {why_not_written(error, self.path)}")
 
     def outline(self) -> StoredMap:
         """Return what runs continue from (`outline_map`). Raises StoreError."""
@@ -166,7 +204,8 @@ class MapStore:
             return set_aside(self.path)
         finally:
             self._opened = None
-            self._db = open_writer(self.path, self._durable)
+            database.create_private(self.path)
+            self._db = open_writer(self.path, self._durable, time.time())
             self._file_ids = _read_file_ids(self.path)
 
     def close(self) -> None:
@@ -223,19 +262,20 @@ def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
 
 _RUN_COLUMNS = (
     *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
-    *(("loop", "a_run"), ("loop", "b_run"), ("image", "run"), ("view", "run")),
+    *(("loop", "a_run"), ("loop", "b_run"), ("arrival", "run"), ("image", "run"), ("view", "run")),
 )
 
 
-def apply_change(db: sqlite3.Connection, change: MapChange) -> None:
-    """Apply one change; again it changes nothing. Raises ValueError for a keyframe of an unknown run."""
+def apply_change(db: sqlite3.Connection, change: MapChange, now_s: float) -> None:
+    """Apply one change; again it changes nothing. now_s: unix s. Raises ValueError for a keyframe of an
+    unknown run."""
     match change:
         case SaveRun():
             _insert_run(db, change)
         case SaveCredential(run, credential):
             _set_credential(db, run, credential)
         case SaveKeyframe():
-            _insert_keyframe(db, change)
+            _insert_keyframe(db, change, now_s)
         case SaveLink():
             _delete_row(db, "link", change.key)
             insert(db, "link", rows.link_row(change))
@@ -273,11 +313,12 @@ def _set_credential(db: sqlite3.Connection, run: str, credential: str | None) ->
         insert(db, "about", row)
 
 
-def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe) -> None:
+def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe, now_s: float) -> None:
     if change.keyframe_key.id < _next_id(db, change.run_key):
         return
     segment, ordinal = _segment_and_ordinal(db, change.run_key, starts_segment=change.keyframe.reference < 0)
     insert(db, "keyframe", rows.keyframe_row(change, segment, ordinal))
+    insert(db, "arrival", rows.arrival_row(change.keyframe_key, now_s))
     if len(jpeg := change.keyframe.image.jpeg):
         insert(db, "image", rows.image_row(change.keyframe_key, jpeg))
 
@@ -317,7 +358,7 @@ def _insert_loop(db: sqlite3.Connection, change: SaveLoop) -> None:
 
 def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
     next_id = _next_id(db, key.agent)
-    for table in ("keyframe", "link", "image", "view"):
+    for table in ("keyframe", "link", "arrival", "image", "view"):
         _delete_row(db, table, key)
     db.execute("DELETE FROM loop WHERE a_run = ? AND a_id = ?", key)
     db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)

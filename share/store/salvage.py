@@ -27,6 +27,7 @@ from share.store.schema import PAGE_BYTES, own_tables
 _DELETE_ORPHANS = (
     "DELETE FROM keyframe WHERE run NOT IN (SELECT key FROM run)",
     "DELETE FROM link WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
+    "DELETE FROM arrival WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
     "DELETE FROM image WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
     "DELETE FROM view WHERE (run, id) NOT IN (SELECT run, id FROM keyframe)",
     "DELETE FROM loop WHERE (a_run, a_id) NOT IN (SELECT run, id FROM keyframe)"
@@ -73,6 +74,7 @@ def salvage(path: Path) -> tuple[ReadRows, Path]:
     read_rows = merge_run_copies(read_damaged(path, path.parent))
     part = path.with_name(path.name + ".salvaged.part")
     part.unlink(missing_ok=True)
+    database.create_private(part)
     with database.translate_errors(part, "written"), write_errors(part):
         _write_rows(read_rows, part)
         part.replace(_salvaged_path(path))
@@ -94,6 +96,7 @@ def finish_salvage(path: Path) -> Path:
 def set_aside(path: Path) -> Path:
     """Rename a map that is not open, and its log. Return the new name. Raises ShareError."""
     renamed = _free_name(path)
+    database.make_private(path)
     with write_errors(path):
         for old, new in ((wal_path(path), wal_path(renamed)), (path, renamed)):
             if old.exists():

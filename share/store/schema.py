@@ -32,12 +32,14 @@ CREATE INDEX loop_b ON loop(b_run, b_id);
 CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc INTEGER)
 """  # noqa: E501
 _ADDED = {  # by schema; last in the file, so that page 1 of an older file differs in nothing else
+    4: "CREATE TABLE arrival(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, unix_s INTEGER, crc INTEGER,"
+    " UNIQUE(run, id))",
     5: "CREATE TABLE image(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, jpeg BLOB, crc INTEGER,"
     " UNIQUE(run, id));\n"
     "CREATE TABLE view(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, view BLOB, crc INTEGER,"
     " UNIQUE(run, id))",
 }
-ADDED_TABLES = ("image", "view")  # which an older file lacks
+ADDED_TABLES = ("arrival", "image", "view")  # which an older file lacks
 LARGE_TABLES = ("image", "view")  # whose rows are read when they are needed, not when the file is opened
 
 
