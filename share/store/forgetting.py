@@ -58,11 +58,12 @@ class Forgetting:
 
 
 def _check_space(path: Path) -> None:
-    """Raises StoreError where the file cannot be rewritten: that takes its size once more, and a log of it."""
+    """Raises StoreError where the file cannot be rewritten, which takes its size twice more for a while."""
     need, free = 2 * path.stat().st_size, shutil.disk_usage(path.parent).free
     if need > free:
         raise StoreError(
-            f"{path}: nothing was deleted: rewriting it takes {need / 1e6:.0f} MB, {free / 1e6:.0f} MB are free"
+            f"{path}: nothing was deleted: rewriting it takes {need / 1e6:.0f} MB, "
+            f"and {free / 1e6:.0f} MB are free"
         )
 
 
