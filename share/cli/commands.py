@@ -20,7 +20,7 @@ COMMANDS = {
     "dataset": (
         "share.cli.dataset",
         "dataset",
-        "Inspect, convert, recover and align recordings; export maps, delete from them.",
+        "Inspect, convert, recover, align recordings; export maps, forget.",
     ),
     "dataset align": (
         "share.cli.dataset_align",
