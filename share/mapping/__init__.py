@@ -1,7 +1,7 @@
 """The edge's map of all agents: keyframes in, corrections out (docs/understand/mapping.md).
 
-Begin with `mapper.Mapper`: `mapper.Mapper._look_up` is a keyframe's way, `mapper.Mapper._solve_map` that of a
-map that has changed:
+Begin with `mapper.Mapper`: `keyframe_lookup.KeyframeLookup.look_up` is a keyframe's way, `Mapper._solve_map`
+that of a map that has changed:
 
     query_queue          which keyframe is looked up next
     recognition          align the images of keyframes nearby (`recognition.patch_alignment`); find others

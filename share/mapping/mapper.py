@@ -1,61 +1,31 @@
 """The mapper: keyframes in, corrections out.
 
-A keyframe's way (`Mapper._look_up`): align its image with those near it in its map -> describe it -> query
--> review recent merges -> align or verify each candidate -> agreement of the agents -> loop acceptance. The
-merge gate is before an alignment. A map that has changed (`Mapper._solve_map`): optimise ->
-localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values that the
-caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved together
-afterwards.
+A keyframe: look up its loops (`share.mapping.keyframe_lookup`). A map that has changed (`Mapper._solve_map`):
+optimise -> localisation gate -> publish corrections. Both are jobs that yield their slow steps, frozen values
+that the caller runs, one of each job at a time. Changes that arrive while a map is being solved are solved
+together afterwards.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, cast
 
 from share.config import Config
-from share.errors import describe_exception
-from share.mapping.agents.quarantine import QuarantineChange
 from share.mapping.atlas import Atlas
-from share.mapping.candidates import choose_checks, larger_maps_first
 from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
 from share.mapping.forgetting import Retention, forgetting_changes
+from share.mapping.keyframe_lookup import KeyframeLookup
 from share.mapping.keyframe_removal import RemovedKeyframe
-from share.mapping.loop_acceptance import LoopDecision
-from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.map_changes import (
-    MapChange,
-    RemoveLoops,
-    SaveLoop,
-    SavePoses,
-    SaveView,
-    StoredMap,
-)
-from share.mapping.map_solving import AppliedSolution
-from share.mapping.mapper_counters import MapperCounters
-from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, restored_ranks, service_kind
-from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeArchive, KeyframeViews
-from share.mapping.recognition.nearby import nearby_candidates
-from share.mapping.recognition.verification import Refusal, Verification
-from share.mapping.steps import (
-    AlignStep,
-    DescribeStep,
-    IndexStep,
-    Job,
-    LookupStep,
-    QueryStep,
-    SolveStep,
-    Step,
-    StepRunner,
-    VerifyStep,
-)
-from share.scheduling.merge_gate import MergeGate
-from share.types import F64, Keyframe, View
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import MapChange, SavePoses, StoredMap
+from share.mapping.mapper_log import MapperLog
+from share.mapping.query_queue import QueryQueue, map_rank, restored_ranks, service_kind
+from share.mapping.recognition.keyframe_views import KeyframeArchive, KeyframeViews
+from share.mapping.steps import Job, LookupStep, SolveStep, Step, StepRunner
+from share.types import Keyframe
 from share.wire.messages import Hello
-
-_RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
-_RETRY_INTERVAL = 4  # nodes of every fourth id are compared with those of agents that are kept apart too
 
 
 class Mapper:
@@ -68,13 +38,12 @@ class Mapper:
         self._views = KeyframeViews(archive)
         self.atlas = Atlas(config.merge, self._views.by_node)
         self._queries = QueryQueue(config.edge)
-        self._merge_gate = MergeGate(config.control, config.edge.policy)
         self._publisher = CorrectionPublisher()
-        self._lookup, self._solve = StepRunner(), StepRunner()
-        self._changes: list[MapChange] = []
+        self._log = MapperLog()
+        self._counters = self._log.counters
+        self._lookup = KeyframeLookup(config, self.atlas, self._views, self._queries, self._hellos, self._log)
+        self._lookup_job, self._solve_job = StepRunner(), StepRunner()
         self._empty_runs: list[KeyframeKey] = []
-        self._events: list[MapEvent] = []
-        self._counters = MapperCounters()
         self._retention = Retention(config.edge.keep_days)
 
     # Runs
@@ -111,7 +80,7 @@ class Mapper:
         """Add a keyframe; each once, in order. is_extra: looked up only when nothing else waits."""
         self._counters.runs[agent].newest_id = keyframe.id
         keyframe, link = self.atlas.reconnect(agent, keyframe)
-        self._changes += [] if link is None else [link]
+        self._log.changes += [] if link is None else [link]
         hello = self._hellos[agent]
         node_id = self.atlas.add_keyframe(agent, keyframe, map_rank(self._config, hello))
         self._views.add(node_id, self.atlas.key(node_id), keyframe, hello.rig)
@@ -128,7 +97,7 @@ class Mapper:
     def remove_keyframes(self, node_ids: Sequence[int]) -> None:
         """Remove redundant keyframes, except those that have to stay."""
         removed = self.atlas.remove_keyframes(node_ids)
-        self._changes += [change for keyframe in removed for change in keyframe.changes]
+        self._log.changes += [change for keyframe in removed for change in keyframe.changes]
         self._finish_removal(removed)
 
     def expire(self, now_s: float) -> list[MapEvent]:
@@ -137,7 +106,7 @@ class Mapper:
         if not (expired := self._retention.expired(now_s)):
             return []
         removed = self.atlas.forget_keyframes(expired)
-        self._changes += forgetting_changes(removed)
+        self._log.changes += forgetting_changes(removed)
         self._finish_removal(removed)
         counts = f"{len(removed)} keyframes forgotten, {len(self.atlas)} stay"
         return [MapEvent(None, "expired", f"{counts}: older than {self._config.edge.keep_days:g} days")]
@@ -176,23 +145,23 @@ class Mapper:
 
     def next_lookup(self) -> LookupStep | None:
         """Next step of looking up a keyframe; None if there is none or one is running."""
-        if self._lookup.is_running:
+        if self._lookup_job.is_running:
             return None
-        while (step := self._lookup.next_step()) is None:
+        while (step := self._lookup_job.next_step()) is None:
             if (job := self._next_job()) is None:
                 return None
-            self._lookup.start(job)
+            self._lookup_job.start(job)
         return cast(LookupStep, step)
 
     def _next_job(self) -> Job | None:
         """Next keyframe to look up, or to describe for later queries."""
         while (node_id := self._next_query()) is not None:
             if node_id in self._views.by_node:
-                return self._look_up(node_id)
+                return self._lookup.look_up(node_id)
         if entries := self._views.next_restored():
-            return self._index(entries)
+            return self._lookup.index(entries)
         node_id = self._views.next_undescribed()
-        return None if node_id is None else self._describe(node_id)
+        return None if node_id is None else self._lookup.describe(node_id)
 
     def _next_query(self) -> int | None:
         node_id = self._queries.next_query()
@@ -202,19 +171,19 @@ class Mapper:
 
     def next_solve(self) -> SolveStep | None:
         """Next map to solve; None if there is none or one is running."""
-        for map_id in [] if self._solve.is_running else self.atlas.solving.due_maps():
-            self._solve.start(self._solve_map(map_id))
+        for map_id in [] if self._solve_job.is_running else self.atlas.solving.due_maps():
+            self._solve_job.start(self._solve_map(map_id))
             try:
-                return cast(SolveStep, self._solve.next_step())
+                return cast(SolveStep, self._solve_job.next_step())
             except Exception as error:  # only this map stays unsolved
-                self._events += self.report_failure(SolveStep.kind, error, map_id=map_id)
+                self._log.events += self.report_failure(SolveStep.kind, error, map_id=map_id)
         return None
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
         """Apply a step's result. An exception as the result fails that step only."""
         self._counters.add_step(step.kind, ms)
         try:
-            return (self._solve if isinstance(step, SolveStep) else self._lookup).finish(result)
+            return (self._solve_job if isinstance(step, SolveStep) else self._lookup_job).finish(result)
         except Exception as error:
             if isinstance(step, SolveStep):
                 return self.report_failure(step.kind, error, map_id=step.job.map_id)
@@ -225,168 +194,13 @@ class Mapper:
         self, what: str, error: Exception, agent: str | None = None, map_id: str | None = None
     ) -> list[MapEvent]:
         """Count and report an error; the map goes on without the step. agent, map_id: concerned, if any."""
-        self._counters.failed_steps += 1
-        where = "" if map_id is None else f"map {map_id}: "
-        reason = f"{where}{what}: {describe_exception(error)}"
-        return [MapEvent(agent, "step failed", reason, map_id=map_id)]
+        return self._log.failure(what, error, agent, map_id)
 
     def take_events(self) -> list[MapEvent]:
         """Return the events since the last call that no other method has returned."""
-        events, self._events = self._events, []
-        return events
+        return self._log.take_events()
 
-    # A keyframe's way through the map
-
-    def _look_up(self, node_id: int) -> Job:
-        """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
-        if entries := self._views.next_restored():
-            yield from self._index(entries)
-        is_aligned = yield from self._align_nearby(node_id)
-        seeks_maps = len(self.atlas.map_sizes()) > 1 and not self._queries.is_hurried
-        if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
-            return  # the map is right here; the keyframe is described when nothing waits
-        yield from self._describe(node_id)
-        yield from self._query(node_id, is_aligned)
-
-    def _index(self, entries: Sequence[IndexEntry]) -> Job:
-        """Index restored keyframes."""
-        self._views.index_words((yield IndexStep(entries[0].node_id, self._views.index, entries)))
-        yield []
-
-    def _describe(self, node_id: int) -> Job:
-        """Find the ORB features of a keyframe that came as an image, and review recent merges by them."""
-        if (image := self._views.undescribed_image(node_id)) is None:
-            return
-        key = self.atlas.key(node_id)
-        try:
-            view = yield DescribeStep(node_id, image)
-        except Exception:
-            self._views.describe(node_id, View.empty())  # else it would be tried for ever
-            raise
-        if (packed := self._views.describe(node_id, view)) is not None and len(packed):
-            self._changes.append(SaveView(key, packed))
-        reason = f"keyframe {key.id}: its image is damaged: without it"
-        damaged = [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", reason)]
-        yield [*damaged, *self._review_joins(node_id)]
-
-    def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
-        """Align the images of keyframes near this one by the map's poses. Return whether one did."""
-        views, is_aligned = self._views, False
-        if views.image(node_id) is None:
-            return False
-        for candidate in nearby_candidates(self.atlas.graph, node_id, views.with_image()):
-            if is_aligned and self._queries.is_hurried:
-                break
-            if not {node_id, candidate} <= views.by_node.keys():
-                continue  # removed meanwhile
-            if (step := self._align_step(node_id, candidate)) is not None:
-                is_aligned |= yield from self._check(step, None)
-        return is_aligned
-
-    def _query(self, node_id: int, is_aligned: bool) -> Job:
-        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`."""
-        views, place = self._views.by_node, self._config.place
-        if node_id not in views:
-            return  # removed meanwhile
-        agent = self.atlas.key(node_id).agent
-        excluded = self.atlas.graph.odometry.neighbours(node_id)
-        if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
-            excluded += self.atlas.quarantine.quarantined_nodes(agent)
-        found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
-        if node_id not in views:
-            yield []
-            return
-        by_map, by_looks = choose_checks(
-            self.atlas.graph,
-            node_id,
-            [candidate.id for candidate in found if candidate.id in views],
-            self._views.with_image(),
-            is_aligned,
-            is_recheck=node_id % _RECHECK_INTERVAL == 0,
-        )
-        if self._queries.is_hurried:
-            by_looks = larger_maps_first(self.atlas.graph, by_looks)
-        has_image = self._views.image(node_id) is not None
-        yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
-        search = CandidateSearch([*by_map, *by_looks])
-        while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
-            if {node_id, candidate} <= views.keys():  # else removed meanwhile
-                make_step = self._align_step if candidate in by_map else self._verify_step
-                if (step := make_step(node_id, candidate)) is not None:
-                    yield from self._check(step, search)
-
-    def _align_step(self, node_id: int, candidate: int) -> AlignStep | None:
-        """Step that aligns two keyframes of a map; None where the merge gate leaves it out."""
-        T_c_q = self.atlas.graph.relative_pose(candidate, node_id)
-        a, b = self.atlas.key(candidate), self.atlas.key(node_id)
-        if objection := self._merge_gate.skip_reason(self._overlap_volume(a, b, T_c_q), same_map=True):
-            merges = self._counters.runs[b.agent].merges
-            merges["requested"] += 1
-            merges["skipped"] += 1
-            self._events.append(MapEvent(b.agent, "merge skipped", f"loop {a} - {b}: {objection}"))
-            return None
-        images = self._views.image(node_id), self._views.image(candidate)
-        assert images[0] is not None and images[1] is not None
-        return AlignStep(node_id, images[0], candidate, images[1], T_c_q)
-
-    def _overlap_volume(self, a: KeyframeKey, b: KeyframeKey, T_a_b: F64) -> float:
-        rig_a, rig_b = (self._hellos[key.agent].rig for key in (a, b))
-        return self._merge_gate.overlap_volume(rig_a, rig_b, T_a_b)
-
-    def _verify_step(self, node_id: int, candidate: int) -> VerifyStep:
-        views, images = self._views.by_node, (self._views.image(node_id), self._views.image(candidate))
-        return VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
-
-    def _check(
-        self, step: AlignStep | VerifyStep, search: CandidateSearch | None
-    ) -> Generator[Any, Any, bool]:
-        """Run the step on a candidate and decide on what it finds. Return whether it is verified."""
-        node_id, candidate, outcome = step.node_id, step.candidate_id, None
-        agent = self.atlas.key(node_id).agent
-        try:
-            outcome = yield step
-            is_kept = {node_id, candidate} <= self._views.by_node.keys()
-            events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
-        except Exception as error:  # costs this candidate only
-            events = self.report_failure(step.kind, error, agent)
-        yield events
-        return isinstance(outcome, Verification)
-
-    def _judge_candidate(
-        self, search: CandidateSearch | None, node_id: int, candidate: int, outcome: Verification | Refusal
-    ) -> list[MapEvent]:
-        """Decide on a verified candidate: count, compare the agents, check the loop and add it."""
-        atlas, a, b = self.atlas, self.atlas.key(candidate), self.atlas.key(node_id)
-        counters = self._counters.runs[b.agent]
-        counters.loops_tried += 1
-        if isinstance(outcome, Refusal):
-            return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        if search is not None and not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
-            search.count_verified()
-        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
-        counters.merges["requested"] += 1
-        change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
-        self._record_loops(change)
-        events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
-        decision = atlas.propose(atlas.quarantine.rescale_loop(loop, outcome.depth_scale))
-        self._record_loops(decision)
-        reason = f"{decision.reason} ({outcome.reason})"
-        if not decision.accepted:
-            return [*events, MapEvent(b.agent, "loop not accepted", reason)]
-        counters.merges["done"] += 1
-        self._merge_gate.record_merge(self._overlap_volume(a, b, loop.T_a_b))
-        undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
-        accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
-        return [*events, *undone, accepted]
-
-    def _review_joins(self, node_id: int) -> list[MapEvent]:
-        """Undo a recent merge that the view of a new keyframe contradicts."""
-        known = node_id in self._views.by_node
-        decision = self.atlas.loop_acceptance.review_joins(node_id) if known else None
-        if decision is None:
-            return []
-        self._record_loops(decision)
-        return [MapEvent(self.atlas.key(node_id).agent, "merge undone", decision.reason)]
+    # A map that has changed
 
     def _solve_map(self, map_id: str) -> Job:
         """Optimise a map and publish the corrections that follow."""
@@ -397,7 +211,7 @@ class Mapper:
             self.reset_solver()
             raise
         applied = self.atlas.solving.apply(job, solution)
-        self._record_loops(applied)
+        self._log.record_loops(applied)
         yield self._publisher.publish(map_id, applied)
 
     def reset_solver(self) -> None:
@@ -406,14 +220,9 @@ class Mapper:
 
     # Results
 
-    def _record_loops(self, outcome: LoopDecision | AppliedSolution | QuarantineChange) -> None:
-        self._changes += [RemoveLoops(loop.a, loop.b) for loop in outcome.dropped]
-        self._changes += [SaveLoop(loop) for loop in outcome.added]
-
     def take_changes(self) -> tuple[MapChange, ...]:
         """Return the changes to store since the last call."""
-        changes, self._changes = tuple(self._changes), []
-        return changes
+        return self._log.take_changes()
 
     def take_empty_runs(self) -> tuple[KeyframeKey, ...]:
         """Return the runs without keyframes since the last call, each with its newest keyframe."""

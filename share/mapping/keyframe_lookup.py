@@ -1,0 +1,198 @@
+"""A keyframe's way through the map: the jobs that find its loops.
+
+Align its image with those near it in its map -> describe it -> query -> review recent merges -> align or
+verify each candidate -> agreement of the agents -> loop acceptance. The merge gate is before an alignment.
+Jobs yield their slow steps, which the caller runs (`share.mapping.steps`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from typing import Any
+
+from share.config import Config
+from share.mapping.atlas import Atlas
+from share.mapping.candidates import choose_checks, larger_maps_first
+from share.mapping.corrections import MapEvent
+from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_changes import SaveView
+from share.mapping.mapper_log import MapperLog
+from share.mapping.query_queue import CandidateSearch, QueryQueue
+from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeViews
+from share.mapping.recognition.nearby import nearby_candidates
+from share.mapping.recognition.verification import Refusal, Verification
+from share.mapping.steps import AlignStep, DescribeStep, IndexStep, Job, QueryStep, VerifyStep
+from share.scheduling.merge_gate import MergeGate
+from share.types import F64, View
+from share.wire.messages import Hello
+
+_RECHECK_INTERVAL = 4  # every fourth keyframe is compared by its looks too where the map seems right
+_RETRY_INTERVAL = 4  # nodes of every fourth id are compared with those of agents that are kept apart too
+
+
+class KeyframeLookup:
+    """Finds the loops of keyframes and adds them to the maps of `atlas`. hellos: by run."""
+
+    def __init__(
+        self,
+        config: Config,
+        atlas: Atlas,
+        views: KeyframeViews,
+        queries: QueryQueue,
+        hellos: Mapping[str, Hello],
+        log: MapperLog,
+    ) -> None:
+        self._config, self._atlas, self._views, self._queries = config, atlas, views, queries
+        self._hellos, self._log, self._counters = hellos, log, log.counters
+        self._merge_gate = MergeGate(config.control, config.edge.policy)
+
+    def look_up(self, node_id: int) -> Job:
+        """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
+        if entries := self._views.next_restored():
+            yield from self.index(entries)
+        is_aligned = yield from self._align_nearby(node_id)
+        seeks_maps = len(self._atlas.map_sizes()) > 1 and not self._queries.is_hurried
+        if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
+            return  # the map is right here; the keyframe is described when nothing waits
+        yield from self.describe(node_id)
+        yield from self._query(node_id, is_aligned)
+
+    def index(self, entries: Sequence[IndexEntry]) -> Job:
+        """Index restored keyframes."""
+        self._views.index_words((yield IndexStep(entries[0].node_id, self._views.index, entries)))
+        yield []
+
+    def describe(self, node_id: int) -> Job:
+        """Find the ORB features of a keyframe that came as an image, and review recent merges by them."""
+        if (image := self._views.undescribed_image(node_id)) is None:
+            return
+        key = self._atlas.key(node_id)
+        try:
+            view = yield DescribeStep(node_id, image)
+        except Exception:
+            self._views.describe(node_id, View.empty())  # else it would be tried for ever
+            raise
+        if (packed := self._views.describe(node_id, view)) is not None and len(packed):
+            self._log.changes.append(SaveView(key, packed))
+        reason = f"keyframe {key.id}: its image is damaged: without it"
+        damaged = [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", reason)]
+        yield [*damaged, *self._review_joins(node_id)]
+
+    def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
+        """Align the images of keyframes near this one by the map's poses. Return whether one did."""
+        views, is_aligned = self._views, False
+        if views.image(node_id) is None:
+            return False
+        for candidate in nearby_candidates(self._atlas.graph, node_id, views.with_image()):
+            if is_aligned and self._queries.is_hurried:
+                break
+            if not {node_id, candidate} <= views.by_node.keys():
+                continue  # removed meanwhile
+            if (step := self._align_step(node_id, candidate)) is not None:
+                is_aligned |= yield from self._check(step, None)
+        return is_aligned
+
+    def _query(self, node_id: int, is_aligned: bool) -> Job:
+        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`."""
+        views, place = self._views.by_node, self._config.place
+        if node_id not in views:
+            return  # removed meanwhile
+        agent = self._atlas.key(node_id).agent
+        excluded = self._atlas.graph.odometry.neighbours(node_id)
+        if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
+            excluded += self._atlas.quarantine.quarantined_nodes(agent)
+        found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
+        if node_id not in views:
+            yield []
+            return
+        by_map, by_looks = choose_checks(
+            self._atlas.graph,
+            node_id,
+            [candidate.id for candidate in found if candidate.id in views],
+            self._views.with_image(),
+            is_aligned,
+            is_recheck=node_id % _RECHECK_INTERVAL == 0,
+        )
+        if self._queries.is_hurried:
+            by_looks = larger_maps_first(self._atlas.graph, by_looks)
+        has_image = self._views.image(node_id) is not None
+        yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
+        search = CandidateSearch([*by_map, *by_looks])
+        while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
+            if {node_id, candidate} <= views.keys():  # else removed meanwhile
+                make_step = self._align_step if candidate in by_map else self._verify_step
+                if (step := make_step(node_id, candidate)) is not None:
+                    yield from self._check(step, search)
+
+    def _align_step(self, node_id: int, candidate: int) -> AlignStep | None:
+        """Step that aligns two keyframes of a map; None where the merge gate leaves it out."""
+        T_c_q = self._atlas.graph.relative_pose(candidate, node_id)
+        a, b = self._atlas.key(candidate), self._atlas.key(node_id)
+        if objection := self._merge_gate.skip_reason(self._overlap_volume(a, b, T_c_q), same_map=True):
+            merges = self._counters.runs[b.agent].merges
+            merges["requested"] += 1
+            merges["skipped"] += 1
+            self._log.events.append(MapEvent(b.agent, "merge skipped", f"loop {a} - {b}: {objection}"))
+            return None
+        images = self._views.image(node_id), self._views.image(candidate)
+        assert images[0] is not None and images[1] is not None
+        return AlignStep(node_id, images[0], candidate, images[1], T_c_q)
+
+    def _overlap_volume(self, a: KeyframeKey, b: KeyframeKey, T_a_b: F64) -> float:
+        rig_a, rig_b = (self._hellos[key.agent].rig for key in (a, b))
+        return self._merge_gate.overlap_volume(rig_a, rig_b, T_a_b)
+
+    def _verify_step(self, node_id: int, candidate: int) -> VerifyStep:
+        views, images = self._views.by_node, (self._views.image(node_id), self._views.image(candidate))
+        return VerifyStep(node_id, views[node_id], candidate, views[candidate], *images)
+
+    def _check(
+        self, step: AlignStep | VerifyStep, search: CandidateSearch | None
+    ) -> Generator[Any, Any, bool]:
+        """Run the step on a candidate and decide on what it finds. Return whether it is verified."""
+        node_id, candidate, outcome = step.node_id, step.candidate_id, None
+        agent = self._atlas.key(node_id).agent
+        try:
+            outcome = yield step
+            is_kept = {node_id, candidate} <= self._views.by_node.keys()
+            events = self._judge_candidate(search, node_id, candidate, outcome) if is_kept else []
+        except Exception as error:  # costs this candidate only
+            events = self._log.failure(step.kind, error, agent)
+        yield events
+        return isinstance(outcome, Verification)
+
+    def _judge_candidate(
+        self, search: CandidateSearch | None, node_id: int, candidate: int, outcome: Verification | Refusal
+    ) -> list[MapEvent]:
+        """Decide on a verified candidate: count, compare the agents, check the loop and add it."""
+        atlas, a, b = self._atlas, self._atlas.key(candidate), self._atlas.key(node_id)
+        counters = self._counters.runs[b.agent]
+        counters.loops_tried += 1
+        if isinstance(outcome, Refusal):
+            return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
+        if search is not None and not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
+            search.count_verified()
+        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
+        counters.merges["requested"] += 1
+        change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
+        self._log.record_loops(change)
+        events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
+        decision = atlas.propose(atlas.quarantine.rescale_loop(loop, outcome.depth_scale))
+        self._log.record_loops(decision)
+        reason = f"{decision.reason} ({outcome.reason})"
+        if not decision.accepted:
+            return [*events, MapEvent(b.agent, "loop not accepted", reason)]
+        counters.merges["done"] += 1
+        self._merge_gate.record_merge(self._overlap_volume(a, b, loop.T_a_b))
+        undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
+        accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
+        return [*events, *undone, accepted]
+
+    def _review_joins(self, node_id: int) -> list[MapEvent]:
+        """Undo a recent merge that the view of a new keyframe contradicts."""
+        known = node_id in self._views.by_node
+        decision = self._atlas.loop_acceptance.review_joins(node_id) if known else None
+        if decision is None:
+            return []
+        self._log.record_loops(decision)
+        return [MapEvent(self._atlas.key(node_id).agent, "merge undone", decision.reason)]
