@@ -41,8 +41,7 @@ _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
 _MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
 _ITERATIONS = 6
 _CONVERGED_STEP = 3e-4  # rad and m, at full size
-# relative; a baseline is calibrated no better than the first
-_MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = 1e-3, 1.0
+_MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = 1e-3, 1.0  # relative; no baseline is known better
 _MIN_RHO = 1e-6  # 1/m
 _NOT_VISIBLE = 1e3  # whitened residual of what the pose puts behind the camera
 _RIDGE = 1e-6
