@@ -31,9 +31,7 @@ def replayed(monkeypatch):
     monkeypatch.syspath_prepend(TOOLS)
     made = importlib.import_module("replayed_agents")
     frames = [
-        TrackedFrame(
-            k * PERIOD_NS, np.eye(4), None, candidate(k) if k % 4 == 0 else None, 5 + k * PERIOD_NS
-        )
+        TrackedFrame(k * PERIOD_NS, np.eye(4), None, candidate(k) if k % 4 == 0 else None, 5 + k * PERIOD_NS)
         for k in range(COUNT)
     ]
     track = made.Track(AgentKind.AR, hello_of("ann", 1).rig, frames)
