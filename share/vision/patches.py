@@ -75,7 +75,7 @@ def extract(image: U8, px: F32) -> Patches:
     bend = (gradient[:, :, None] * OFFSETS.T).reshape(len(px), 4, -1)
     bend -= bend.mean(axis=2, keepdims=True)
     bend -= bend @ gradient.transpose(0, 2, 1) @ inverse_hessian @ gradient
-    at_rest = (bend @ kernels[:, 0, :, None])[:, :, 0]
+    at_rest = (bend @ kernels[:, 0, :, None])[:, :, 0].astype(np.float32, copy=False)
     return Patches(shift.contrast, inverse_hessian, kernels, bend, bend @ bend.transpose(0, 2, 1), at_rest)
 
 

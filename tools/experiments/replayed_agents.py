@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from share.config import Config
+from share.earlier_poses import EarlierPoses
 from share.geometry.camera import Rig
 from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.evaluate.virtual_time import track_agent
 from share.recordings.session import Session
 from share.runtime.source import open_source
-from share.types import AgentKind, EarlierPoses, KeyframeCandidate
+from share.types import AgentKind, KeyframeCandidate
 from share.vision.keyframe_images import Surfaces, decompress
 from share.wire.messages import Hello
 
@@ -78,7 +79,8 @@ class ReplayedAgent:
         if pixels is not None:
             noise = self._rng.standard_normal(pixels.shape, np.float32)
             pixels = (pixels + _GRAY * noise).clip(0, 255).astype(np.uint8)
-            image = Surfaces(image.uv, image.plane, image.rho_sigma).with_image(pixels)
+            surfaces = (x.astype(np.float64) for x in (image.uv, image.plane, image.rho_sigma))
+            image = Surfaces(*surfaces).with_image(pixels)
         if not is_begun:
             return replace(
                 candidate,

@@ -39,8 +39,8 @@ from share.mapping.corrections import MapEvent  # noqa: E402
 from share.metrics.frame_log import summary  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
 
-HEAD = ("agents", "corrections: p50, p95 ms", "keyframes a second", "looked up", "answered", "mapper")
-HEAD += ("solver", "mapper ms a keyframe", "by step", "maps")
+HEAD = ["agents", "corrections: p50, p95 ms", "keyframes a second", "looked up", "answered", "mapper"]
+HEAD += ["solver", "mapper ms a keyframe", "by step", "maps"]
 _COUNTED_FROM_S = 10.0
 
 Row = dict[str, Any]

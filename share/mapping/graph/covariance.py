@@ -38,7 +38,7 @@ class ShortestPaths:
 
     def _directed(self, cost: F64) -> F64:
         """Cost of every edge in both directions, sorted by start."""
-        return np.maximum(cost[self._edge_index], 1e-300)  # zero would mean no edge
+        return np.asarray(np.maximum(cost[self._edge_index], 1e-300))  # zero would mean no edge
 
     def set_cost(self, cost: F64) -> None:
         """Change the cost (E,) of the edges."""
