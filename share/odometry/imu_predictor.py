@@ -15,7 +15,7 @@ from share.geometry.camera import ImuNoise
 from share.odometry import filter
 from share.odometry.imu_outliers import ImuInflation, ImuOutlierDetector
 from share.odometry.imu_propagation import integrate, noise_with_vibration, noise_without_axes, scaled_noise
-from share.odometry.state import FilterState
+from share.odometry.state import VELOCITY, FilterState
 from share.types import F64, ImuBatch
 
 _MAX_SAMPLES = 600
@@ -150,7 +150,9 @@ def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
 
 
 _MAX_REST_RATE = 0.03  # rad/s
-_MAX_REST_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to the filter's velocity
+# A smooth ride looks like rest to an IMU, but not to the images: the filter's velocity has to be near zero,
+# and known so well before rest is believed.
+_MAX_REST_M_S, _MAX_REST_SIGMA_M_S = 0.04, 0.03
 _ZERO_VELOCITY_SIGMA = 0.02  # m/s
 _SILENT_NS = 100_000_000  # the IMU counts as silent after this long without a sample; then
 _TURNING_NOISE = 0.5  # rad/s/sqrt(Hz) is the process noise of the angular rate,
@@ -218,8 +220,10 @@ class ImuPredictor:
         return ImuUse(not silent_axes[:3].any(), True, has_rejected)
 
     def _is_at_rest(self, s: FilterState, now_ns: int) -> bool:
-        is_slow = np.linalg.norm(self.rate) < _MAX_REST_RATE and np.linalg.norm(s.v) < _MAX_REST_M_S
-        return bool(is_slow) and self.buffer.is_still(now_ns)
+        if np.linalg.norm(self.rate) >= _MAX_REST_RATE or np.linalg.norm(s.v) >= _MAX_REST_M_S:
+            return False
+        is_known = s.cov.diagonal()[VELOCITY].max() < _MAX_REST_SIGMA_M_S**2
+        return bool(is_known) and self.buffer.is_still(now_ns)
 
     def pose_at(self, s: FilterState, t_ns: int, imu: ImuBatch) -> F64:
         """Return T_odom_body (4, 4) at a time after the state's, with samples that came since.

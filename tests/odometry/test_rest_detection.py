@@ -3,8 +3,9 @@
 import numpy as np
 from helpers.imu_world import NOISE, Path, imu_of
 
+from share.config import InertialConfig
 from share.odometry import filter
-from share.odometry.imu_predictor import ImuBuffer, fill_clipped
+from share.odometry.imu_predictor import ImuBuffer, ImuPredictor, fill_clipped
 from share.odometry.state import CORE_SIZE, VELOCITY, initial_state
 from share.types import ImuBatch
 
@@ -39,6 +40,18 @@ def test_noise_alone_is_rest_and_motion_is_not():
     assert buffered(imu_of(still, t, 0.01, 0.2, rng)[0]).is_still(10**9)
     assert not buffered(imu_of(Path(1, size=1.0, turn=0.0), t, 0.01, 0.2, rng)[0]).is_still(10**9)
     assert not buffered(imu_of(Path(1, size=0.0, turn=0.1), t, 0.01, 0.2, rng)[0]).is_still(10**9)
+
+
+def test_rest_is_believed_once_the_velocity_is_known():
+    """An IMU that moves smoothly measures the same as one at rest."""
+    t, rng = np.arange(0, 1, 1 / NOISE.rate_hz), np.random.default_rng(4)
+    predictor = ImuPredictor(NOISE, InertialConfig())
+    predictor.buffer.add(imu_of(Path(1, size=0.0, turn=0.0), t, rng=rng)[0])
+    for velocity, sigma, is_updated in ((0.0, 0.1, False), (0.08, 0.02, False), (0.01, 0.02, True)):
+        s = state([velocity, 0.0, 0.0], sigma)
+        s.stamp_ns = 900_000_000
+        predictor.predict(s, 950_000_000, gyro_only=False)
+        assert (np.sqrt(s.cov[6, 6]) < 0.8 * sigma) == is_updated
 
 
 def test_no_recent_samples_is_not_rest():
