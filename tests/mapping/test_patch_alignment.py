@@ -109,7 +109,7 @@ def test_the_covariance_is_that_of_right_perturbations_of_the_bodies_pose(
         whitened.append(np.linalg.solve(np.linalg.cholesky(found.cov), xi))
         squared.append(nees(xi, found.cov))
         assert found.inliers > 0.9 * found.found
-    assert 4.2 < np.mean(squared) < 7.0  # 5 directions as stated; the length, which a shared error changes, less
+    assert 4.2 < np.mean(squared) < 7.0  # 5 directions as stated, the length surer
     spread = np.linalg.eigvalsh(np.cov(np.array(whitened).T))
     assert spread[1] > 0.4 and spread[-1] < 1.8
 
