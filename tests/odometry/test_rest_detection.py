@@ -45,11 +45,11 @@ def test_noise_alone_is_rest_and_motion_is_not():
 def test_rest_is_believed_once_the_velocity_is_known():
     """An IMU that moves smoothly measures the same as one at rest."""
     t, rng = np.arange(0, 1, 1 / NOISE.rate_hz), np.random.default_rng(4)
-    predictor = ImuPredictor(NOISE, InertialConfig())
-    predictor.buffer.add(imu_of(Path(1, size=0.0, turn=0.0), t, rng=rng)[0])
+    predictor, still = ImuPredictor(NOISE, InertialConfig()), Path(1, size=0.0, turn=0.0)
+    predictor.buffer.add(imu_of(still, t, rng=rng)[0])
     for velocity, sigma, is_updated in ((0.0, 0.1, False), (0.08, 0.02, False), (0.01, 0.02, True)):
         s = state([velocity, 0.0, 0.0], sigma)
-        s.stamp_ns = 900_000_000
+        s.T, s.stamp_ns = still.poses(0.0), 900_000_000
         predictor.predict(s, 950_000_000, gyro_only=False)
         assert (np.sqrt(s.cov[6, 6]) < 0.8 * sigma) == is_updated
 
