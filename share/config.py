@@ -134,12 +134,15 @@ class EdgeConfig:
     silent_s: float = 3.0  # no message of an agent for this long: it counts as gone
     max_agents: int = 64  # present at once; more are refused
     max_keyframes: int = 2000  # kept; beyond, the agent with most gives up redundant ones first
+    keep_days: float | None = None  # older keyframes, pictures of the room, are forgotten; null: none are
     max_waiting: int = 12  # queued queries; beyond, the oldest keyframe is only stored
 
     def __post_init__(self) -> None:
         if self.policy not in POLICY_NAMES:
             raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICY_NAMES)}")
         _require_positive(self, "max_agents", "max_keyframes", "max_waiting")
+        if self.keep_days is not None:
+            _require_positive(self, "keep_days")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ EventKind = Literal[
     "refused",
     "connection refused",
     "forgotten",
+    "expired",
     # what they send
     "bad message",
     "odometry suspect",

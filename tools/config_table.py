@@ -28,6 +28,7 @@ UNITS = {
     "_ms": "ms",
     "_us": "µs",
     "_s": "s",
+    "_days": "d",
     "_px": "px",
     "_rad": "rad",
     "_deg": "°",
@@ -83,6 +84,7 @@ def _settings(node: ast.ClassDef, comments: dict[int, str]) -> Iterator[Setting]
             name = ast.unparse(field.target)
             unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
             default = ast.unparse(field.value).replace("field(default_factory=dict)", "{}")
+            default = "null" if default == "None" else default  # as YAML has it
             yield Setting(name, default, unit, comments.get(field.lineno, ""))
 
 

@@ -1,4 +1,4 @@
-"""`share dataset`: inspect, convert, recover and align recordings; inspect and export maps."""
+"""`share dataset`: inspect, convert, recover and align recordings; inspect, export and prune maps."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import click
 
 from share.cli import options
 from share.cli.dataset_align import align
+from share.cli.dataset_forget import forget
 from share.cli.terminal import print_note, progress
 from share.errors import UsageError
 
 
 @click.group()
 def dataset() -> None:
-    """Inspect, convert, recover and align recordings; inspect and export maps.
+    """Inspect, convert, recover and align recordings; inspect maps, export them, delete agents from them.
 
     \b
     Example:  share dataset info rec/kitchen
@@ -24,6 +25,7 @@ def dataset() -> None:
 
 
 dataset.add_command(align)
+dataset.add_command(forget)
 
 
 @dataset.command(short_help="Describe a recording or a map.")
@@ -212,7 +214,7 @@ def _camera_text(camera: dict[str, Any]) -> str:
 
 
 def _map_text(d: dict[str, Any]) -> str:
-    lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
+    lines = [f"{d['name']}: map, schema {d['schema'] or '?'}, {d['bytes'] / 1e6:.1f} MB"]
     for name, agent in d["agents"].items():
         removed = agent["next_keyframe"] - agent["keyframes"]
         segments_text = f", {agent['segments']} segments" if agent["segments"] > 1 else ""

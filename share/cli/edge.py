@@ -139,6 +139,7 @@ _SHOWN_EVENTS: set[EventKind] = {  # without -v
     "left",
     "reconnected",
     "silent",
+    "expired",
     "refused",
     "connection refused",
     "maps merged",

@@ -46,6 +46,13 @@ class _Size(click.ParamType[tuple[float, ...]]):
 @click.option("--out", required=True, metavar="SESSION", type=options.PATH, help="A new folder.")
 @click.option("--seconds", type=float, default=30, help="Length of the session, s.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the room and the noise.")
+@click.option(
+    "--day",
+    type=click.IntRange(0),
+    default=0,
+    help="The same room on another day: other light, paths and noise; loose things moved, a third of the "
+    "cartons gone.",
+)
 @click.option("--size", type=_Size(), metavar="LxWxH", help="Size of the room, m.  [default: the scene's]")
 @click.option(
     "--profile",
@@ -89,6 +96,7 @@ def emulate(
     out: Path,
     seconds: float,
     seed: int,
+    day: int,
     size: tuple[float, float, float] | None,
     profiles: tuple[str, ...],
     sensors: tuple[str, ...],
@@ -139,6 +147,7 @@ def emulate(
         profiles=options.values_by_name("--profile", profiles),
         effects=parse_effects(effects),
         images=images or ("png" if euroc else "jpeg"),
+        day=day,
     )
     with Stages() as stages:
         folder = make_session(recipe, out, workers, stages, asl=euroc)

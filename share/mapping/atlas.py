@@ -6,7 +6,7 @@ Plain sequential calls, without clock or thread.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from share.config import MergeConfig
@@ -14,7 +14,12 @@ from share.mapping.agents.covariance_scales import inflate_covariance
 from share.mapping.agents.quarantine import Quarantine
 from share.mapping.culling import KeyframeCulling
 from share.mapping.graph.gravity import make_gravity_factor
-from share.mapping.keyframe_removal import RemovedKeyframe, reconnect, remove_keyframe
+from share.mapping.keyframe_removal import (
+    RemovedKeyframe,
+    reconnect,
+    remove_keyframe,
+    remove_segment,
+)
 from share.mapping.localisation_gate import LocalisationGate
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
@@ -181,22 +186,47 @@ class Atlas:
         return node_ids
 
     def remove_keyframes(self, node_ids: Iterable[int]) -> list[RemovedKeyframe]:
-        """Remove keyframes, except those that have to stay by now."""
-        graph, removed = self.graph, list[RemovedKeyframe]()
+        """Remove redundant keyframes, except those that have to stay by now."""
+        removed = list[RemovedKeyframe]()
         for node_id in node_ids:
-            if node_id in graph.poses and self.culling.is_removable(node_id):
-                segment = graph.odometry.nodes[node_id].segment
-                removed.append(self.quarantine.to_agent_scale(remove_keyframe(graph, node_id)))
-                graph.update_maps()
-                if segment not in graph.odometry.live_segments:
-                    self._localisation_gate.forget([segment])
+            if node_id in self.graph.poses and self.culling.is_removable(node_id):
+                removed.append(remove_keyframe(self.graph, node_id))
+                self.graph.update_maps()
+        return self._finish_removal(removed)
+
+    def forget_keyframes(self, node_ids: Collection[int]) -> list[RemovedKeyframe]:
+        """Remove keyframes, whatever depends on them.
+
+        Keyframes that stay keep their poses. What only removed keyframes connected becomes several maps; a
+        map whose reference segment is gone is named by the next one.
+        """
+        graph, removed = self.graph, list[RemovedKeyframe]()
+        before, is_removed = list(graph.reference_segments), set(node_ids)
+        self.culling.start_over()
+        for segment in list(graph.odometry.live_segments):
+            nodes = graph.odometry.segments[segment].nodes
+            if is_removed.issuperset(nodes):
+                removed += remove_segment(graph, segment)
+            else:
+                removed += [remove_keyframe(graph, n) for n in sorted(is_removed.intersection(nodes))]
+        graph.update_maps()
+        for segment in graph.odometry.live_segments:
+            if (reference_segment := graph.reference_segments[segment]) != before[segment]:
+                graph.split_segments.add(segment)
+                graph.unsolved_maps[reference_segment] = None
+        return self._finish_removal(removed)
+
+    def _finish_removal(self, removed: Sequence[RemovedKeyframe]) -> list[RemovedKeyframe]:
+        """Forget what else is known of removed keyframes. Return them as the map file keeps them."""
+        graph = self.graph
+        self._localisation_gate.forget_all_but(graph.odometry.live_segments)
         live = {graph.reference_segments[segment] for segment in graph.odometry.live_segments}
         graph.unsolved_maps = dict.fromkeys(
             reference_segment for reference_segment in graph.unsolved_maps if reference_segment in live
         )
         self.loop_acceptance.remove_keyframes({out.key for out in removed})
         self.quarantine.agreement.remove_nodes([out.node_id for out in removed], graph.odometry.live_segments)
-        return removed
+        return [self.quarantine.to_agent_scale(out) for out in removed]
 
     # Loops
 

@@ -73,6 +73,20 @@ def remove_keyframe(graph: MapGraph, node_id: int) -> RemovedKeyframe:
     return RemovedKeyframe(node_id, key, link, tuple(loop for loop in moved_loops if loop is not None))
 
 
+def remove_segment(graph: MapGraph, segment: int) -> list[RemovedKeyframe]:
+    """Remove all keyframes of a segment, with odometry and loops. Call `graph.update_maps` afterwards."""
+    edges, out = graph.edges, list[RemovedKeyframe]()
+    for node_id in list(graph.odometry.segments[segment].nodes):
+        for n in edges.incident(node_id):
+            if n in edges.loops:
+                graph.remove_loop_edge(n)
+            else:
+                edges.remove(n)
+        out.append(RemovedKeyframe(node_id, graph.odometry.nodes[node_id].key, None, ()))
+        graph.remove_node(node_id)
+    return out
+
+
 def _current_link(graph: MapGraph, previous: int | None, node_id: int) -> SaveLink:
     """Odometry edge to a node from the node before it, if any."""
     node = graph.odometry.nodes[node_id]

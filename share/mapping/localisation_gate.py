@@ -43,10 +43,9 @@ class LocalisationGate:
         """An earlier session published this map to the segment; its covariance there is not known yet."""
         self._published[segment] = (reference_segment, None)
 
-    def forget(self, segments: Collection[int]) -> None:
-        """Forget segments without keyframes."""
-        for segment in segments:
-            self._published.pop(segment, None)
+    def forget_all_but(self, segments: Collection[int]) -> None:
+        """Forget all but these segments: the others have no keyframes."""
+        self._published = {s: known for s, known in self._published.items() if s in segments}
 
     def is_published(self, segment: int, reference_segment: int) -> bool:
         """Return whether the segment's agent was sent a correction in this map."""

@@ -60,11 +60,12 @@ class StoredKeyframe(SaveKeyframe):
     """A keyframe read back. segment_name: `run_key/n`, the n-th of its run.
 
     A keyframe without a reference begins a segment. ordinal: number of keyframes before it there, including
-    removed ones unless they were the newest.
+    removed ones unless they were the newest. came_s: when it was stored, unix s; None if unknown.
     """
 
     segment_name: str
     ordinal: int
+    came_s: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +126,11 @@ class RemoveRun:
     run_key: str
 
 
+@dataclass(frozen=True)
+class Wipe:
+    """What was removed must not be readable in the file's log either."""
+
+
 @dataclass(frozen=True, eq=False)
 class SavePoses:
     """The newest solution, which replaces the one before.
@@ -164,6 +170,7 @@ MapChange = (
     | RemoveLoops
     | RemoveKeyframes
     | RemoveRun
+    | Wipe
     | SavePoses
 )
 

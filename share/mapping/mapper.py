@@ -11,7 +11,6 @@ afterwards.
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import asdict
 from typing import Any, cast
 
 from share.config import Config
@@ -19,19 +18,22 @@ from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
 from share.mapping.atlas import Atlas
 from share.mapping.corrections import CorrectionPublisher, MapEvent, map_assignment
+from share.mapping.forgetting import Retention, forgetting_changes
+from share.mapping.keyframe_removal import RemovedKeyframe
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.map_changes import (
-    MapChange,
-    RemoveLoops,
-    SaveLoop,
-    SavePoses,
-    SaveView,
-    StoredMap,
-)
+from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop, SavePoses, SaveView, StoredMap
 from share.mapping.map_solving import AppliedSolution
 from share.mapping.mapper_counters import MapperCounters
-from share.mapping.query_queue import CandidateSearch, QueryQueue, map_rank, rank_candidates, service_kind
+from share.mapping.mapper_report import mapper_report
+from share.mapping.query_queue import (
+    CandidateSearch,
+    QueryQueue,
+    map_rank,
+    rank_candidates,
+    restored_ranks,
+    service_kind,
+)
 from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeArchive, KeyframeViews
 from share.mapping.recognition.nearby import nearby_candidates
 from share.mapping.recognition.verification import Refusal, Verification
@@ -72,6 +74,7 @@ class Mapper:
         self._empty_runs: list[KeyframeKey] = []
         self._failures: list[MapEvent] = []
         self._counters = MapperCounters()
+        self._retention = Retention(config.edge.keep_days)
 
     # Runs
 
@@ -90,6 +93,8 @@ class Mapper:
 
     def set_present(self, agent: str, is_present: bool) -> None:
         self.atlas.set_present(agent, is_present)
+        if self.atlas.is_run_gone(agent) and self._counters.runs[agent].newest_id >= 0:
+            self._note_empty(agent)  # its keyframes expired while it was connected
 
     def remove_run(self, agent: str) -> None:
         """Forget a run without keyframes that will not return."""
@@ -109,6 +114,7 @@ class Mapper:
         hello = self._hellos[agent]
         node_id = self.atlas.add_keyframe(agent, keyframe, map_rank(self._config, hello))
         self._views.add(node_id, self.atlas.key(node_id), keyframe, hello.rig)
+        self._retention.add(node_id)
         self._queries.add(agent, service_kind(self._config, hello), node_id, is_extra)
         events = []
         if keyframe.reference < 0 or (link is not None and link.reference < 0):
@@ -119,15 +125,33 @@ class Mapper:
         return events
 
     def remove_keyframes(self, node_ids: Sequence[int]) -> None:
-        """Remove keyframes, except those that have to stay."""
+        """Remove redundant keyframes, except those that have to stay."""
         removed = self.atlas.remove_keyframes(node_ids)
+        self._changes += [change for keyframe in removed for change in keyframe.changes]
+        self._finish_removal(removed)
+
+    def expire(self, now_s: float) -> list[MapEvent]:
+        """Forget keyframes that came more than `edge.keep_days` before now_s (unix s), whatever depends on
+        them."""
+        if not (expired := self._retention.expired(now_s)):
+            return []
+        removed = self.atlas.forget_keyframes(expired)
+        self._changes += forgetting_changes(removed)
+        self._finish_removal(removed)
+        counts = f"{len(removed)} keyframes forgotten, {len(self.atlas)} stay"
+        return [MapEvent(None, "expired", f"{counts}: older than {self._config.edge.keep_days:g} days")]
+
+    def _finish_removal(self, removed: Sequence[RemovedKeyframe]) -> None:
         for keyframe in removed:
             self._views.remove(keyframe.node_id)
-            self._changes += keyframe.changes
+            self._retention.remove(keyframe.node_id)
         self._counters.removed_keyframes += len(removed)
         for agent in sorted({keyframe.key.agent for keyframe in removed}):
             if self.atlas.is_run_gone(agent):
-                self._empty_runs.append(KeyframeKey(agent, self._counters.runs[agent].newest_id))
+                self._note_empty(agent)
+
+    def _note_empty(self, agent: str) -> None:
+        self._empty_runs.append(KeyframeKey(agent, self._counters.runs[agent].newest_id))
 
     def restore(self, kept: StoredMap) -> None:
         """Restore the map of an earlier session, before anything else is added.
@@ -138,17 +162,13 @@ class Mapper:
         for run in kept.runs:
             self.add_run(run.run_key, run.hello, run.credential)
             self.set_present(run.run_key, False)
-        references = set[str]() if kept.poses is None else set(kept.poses.map_ids)
-        hellos = self._hellos  # a damaged file may lack the run of a segment, never that of a keyframe
-        ranks = [
-            map_rank(self._config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
-            for name in kept.segments
-        ]
-        restored = list(zip(self.atlas.restore(kept, ranks), kept.keyframes, strict=True))
+        node_ids = self.atlas.restore(kept, restored_ranks(self._config, kept))
+        restored = list(zip(node_ids, kept.keyframes, strict=True))
         self._views.restore(
-            [(n, one.keyframe_key, one.keyframe, hellos[one.run_key].rig) for n, one in restored]
+            [(n, one.keyframe_key, one.keyframe, self._hellos[one.run_key].rig) for n, one in restored]
         )
-        for stored in kept.keyframes:
+        for node_id, stored in restored:
+            self._retention.add(node_id, stored.came_s)
             self._counters.runs[stored.run_key].newest_id = stored.keyframe.id
 
     # Steps: what to do next, and what follows from the result
@@ -374,18 +394,4 @@ class Mapper:
 
     def report(self) -> dict[str, Any]:
         """Return the mapper's fields of edge.json, and under `agents` those of each run."""
-        atlas = self.atlas
-        return {
-            "agents": {
-                agent: {
-                    **own.report(),
-                    "queries_skipped": self._queries.skipped[agent],
-                    "map_id": atlas.current_map_id(agent),
-                    "consistency": asdict(atlas.quarantine.agreement.standing(agent)),
-                }
-                for agent, own in self._counters.runs.items()
-            },
-            "maps": atlas.map_sizes(),
-            "waiting": len(self._queries),
-            **self._counters.report(len(atlas.loop_acceptance.pending), len(atlas.graph.edges.loops)),
-        }
+        return mapper_report(self.atlas, self._queries, self._counters)

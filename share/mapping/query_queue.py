@@ -9,6 +9,7 @@ import numpy as np
 
 from share.config import Config, EdgeConfig
 from share.geometry import se3
+from share.mapping.map_changes import StoredMap
 from share.mapping.map_graph import MapGraph
 from share.scheduling.policies import POLICIES
 from share.scheduling.qoe import QoeParameters
@@ -70,6 +71,16 @@ def map_rank(config: Config, hello: Hello | None, is_reference: bool = False) ->
     """
     is_headset = hello is not None and qoe_form(config, hello) is AgentKind.AR
     return (0 if is_headset else 1) + (0 if is_reference else 2)
+
+
+def restored_ranks(config: Config, kept: StoredMap) -> list[int]:
+    """Rank of each segment of a restored map. Restored maps keep their reference segments."""
+    references = set[str]() if kept.poses is None else set(kept.poses.map_ids)
+    hellos = {run.run_key: run.hello for run in kept.runs}  # a damaged file may lack a segment's run
+    return [
+        map_rank(config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
+        for name in kept.segments
+    ]
 
 
 class QueryQueue:

@@ -29,6 +29,7 @@ T = TypeVar("T")
 
 _REPORT_S = 1.0  # period of reports
 _SAVE_POSES_S = 5.0  # period of saving all poses
+_EXPIRE_S = 60.0  # period of forgetting old keyframes
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ class _MapperProcess:
         self._solve_start_s = 0.0
         self._keyframe_queue = FairQueue[AddKeyframe]()
         self._findings: list[MapEvent] = []
-        self._report_due_s = self._poses_due_s = 0.0
+        self._report_due_s = self._poses_due_s = self._expire_due_s = 0.0  # monotonic
         self._has_new_poses = False
         self._heap = HeapTrimmer()
         self._is_ended = False
@@ -127,6 +128,7 @@ class _MapperProcess:
         while not self._is_ended:
             for message in self._receive(wait=step is None and not self._keyframe_queue):
                 self._handle(message)
+            self._expire()
             self._add_keyframes()
             self._send_to_solver()
             self._publish()
@@ -150,7 +152,7 @@ class _MapperProcess:
         match message:
             case RestoreMap():
                 self._mapper.restore(message.stored_map)
-                self._is_restoring = True
+                self._is_restoring, self._expire_due_s = True, 0.0
             case AddRun():
                 self._mapper.add_run(message.key, message.hello, message.credential)
             case SetCredential():
@@ -167,6 +169,12 @@ class _MapperProcess:
                 self._restart_solver(message.reason)
             case _ if message is END:
                 self._is_ended = True
+
+    def _expire(self) -> None:
+        """Forget keyframes that are too old: at once after a restart, then every minute."""
+        if time.monotonic() >= self._expire_due_s:
+            self._expire_due_s = time.monotonic() + _EXPIRE_S
+            self._findings += self._guarded("forget", partial(self._mapper.expire, time.time()), [])
 
     def _add_keyframes(self) -> None:
         """Add waiting keyframes as far as the queue's time budget allows; at the end all of them."""

@@ -6,6 +6,7 @@ import contextlib
 import os
 import resource
 import sqlite3
+import stat
 import tempfile
 import time
 from collections.abc import Iterator
@@ -59,6 +60,7 @@ def open_for_writing(path: Path, durable: bool) -> sqlite3.Connection:
     connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
     connection.execute(f"PRAGMA wal_autocheckpoint = {WAL_PAGES}")
     connection.execute(f"PRAGMA journal_size_limit = {4 * WAL_PAGES * PAGE_BYTES}")
+    connection.execute("PRAGMA secure_delete = ON")  # what is removed is overwritten with zeros
     return connection
 
 
@@ -203,12 +205,39 @@ def write_obstacle(path: Path) -> str:
         return f"its folder cannot be written: {error.strerror or error}"
 
 
+def create_private(path: Path) -> None:
+    """Create the file of a new map, which only its owner may read; SQLite gives the log the same mode. An
+    existing one is not opened: see `write_obstacle`. Raises StoreError."""
+    try:
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600))
+    except FileExistsError:
+        make_private(path)
+    except OSError as error:
+        raise StoreError(f"{path}: the map cannot be written: {error.strerror}") from None
+
+
+def make_private(path: Path) -> None:
+    """Let only its owner read a map that all users may read, if the file system and its owner allow.
+
+    One that only a group may read besides was made so on purpose, and stays so.
+    """
+    for file in (path, wal_path(path), shm_path(path)):
+        with contextlib.suppress(OSError):
+            if is_public(file):
+                file.chmod(stat.S_IMODE(file.stat().st_mode) & stat.S_IRWXU)
+
+
+def is_public(file: Path) -> bool:
+    """Return whether all users of this machine may read or write the file."""
+    return file.exists() and bool(file.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH))
+
+
 def lock_map(path: Path) -> int:
     """Lock the map by a file beside it, which is released when this process ends. Return a handle; close it
     to unlock. Raises StoreError while another edge has the lock."""
     name = path.with_name(path.name + ".lock")
     try:
-        handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+        handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
     except OSError as error:
         raise StoreError(f"{name}: cannot be locked: {error.strerror}; remove it") from None
     try:

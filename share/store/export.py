@@ -19,7 +19,6 @@ from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
 from share.recordings.trajectory import Trajectory, format_tum
 from share.store.map_store import MapStore
-from share.store.schema import SCHEMA
 from share.types import F64
 
 COLOURS: tuple[Colour, ...] = (  # matplotlib's tab10: one per run, in order of arrival
@@ -144,7 +143,7 @@ def describe_map(store: MapStore) -> dict[str, Any]:
     log = wal_path(store.path)
     return {
         "name": store.path.name,
-        "schema": SCHEMA,
+        "schema": store.schema,
         "bytes": store.path.stat().st_size + (log.stat().st_size if log.exists() else 0),
         "keyframes": len(stored_map.keyframes),
         "agents": _describe_agents(stored_map),

@@ -17,6 +17,7 @@ from share.mapping.keyframe_removal import reconnect
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink, SavePoses, StoredKeyframe, StoredMap, odometry_link
 from share.store import database, rows, schema
+from share.store.conversion import convert
 from share.store.database import DamageError, translate_errors
 from share.store.rows import Row
 from share.store.salvage import (
@@ -76,14 +77,15 @@ def _opened(read_rows: ReadRows) -> OpenedMap:
     return OpenedMap(read_rows, outline_map(read_rows).problems)
 
 
-def open_writer(path: Path, durable: bool) -> sqlite3.Connection:
-    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables."""
+def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
+    """Open the writer's connection to a file that `read_and_repair` has checked; create or convert its
+    tables. now_s: unix s, see `convert`."""
     with translate_errors(path, "opened"):
         connection = database.open_for_writing(path, durable)
         connection.execute("BEGIN IMMEDIATE")
         if schema.is_empty(connection):
             schema.create(connection)
-        schema.convert(connection)
+        convert(connection, now_s)
         connection.execute("COMMIT")
     return connection
 
@@ -121,12 +123,11 @@ def _read_intact(path: Path) -> ReadRows:
             return ReadRows.empty()
         if not schema.matches_schema(connection):
             raise DamageError(f"{path}: the map is damaged: its tables")
-        tables = schema.own_tables(connection) - {*schema.LARGE_TABLES}
-        for table in sorted(tables):
+        for table in sorted(schema.own_tables(connection) - {*schema.LARGE_TABLES}):
             (verdict,) = connection.execute(f"PRAGMA integrity_check({table})").fetchone()
             if verdict != "ok":
                 raise DamageError(f"{path}: the map is damaged: {verdict}")
-        read_rows = read_intact_rows(connection, [table for table in rows.COLUMNS if table in tables])
+        read_rows = read_intact_rows(connection, schema.SMALL_TABLES)
     if read_rows.is_damaged:
         raise DamageError(f"{path}: the map is damaged: its rows")
     return read_rows
@@ -190,8 +191,10 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     links, lost_links = _decode_rows(read_rows, "link", rows.read_link)
     loops, lost_loops = _decode_rows(read_rows, "loop", rows.read_loop)
     poses, lost_poses = _decode_rows(read_rows, "poses", rows.read_poses)
+    arrivals = dict(_decode_rows(read_rows, "arrival", rows.read_arrival)[0])
     repaired = repair_references(
-        [k for k in keyframes if k.run_key in runs], {link.key: link for link in links}
+        [replace(k, came_s=arrivals.get(k.keyframe_key)) for k in keyframes if k.run_key in runs],
+        {link.key: link for link in links},
     )
     known_keys = {k.keyframe_key for k in repaired.keyframes}
     connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)

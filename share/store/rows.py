@@ -31,6 +31,7 @@ COLUMNS = {
     "link": ("run", "id", "reference", "T_ref_body", "cov"),
     "loop": ("a_run", "a_id", "b_run", "b_id", "T_a_b", "cov", "inliers", "found"),
     "poses": ("keys", "T_map_body"),
+    "arrival": ("run", "id", "unix_s"),
     "image": ("run", "id", "jpeg"),
     "view": ("run", "id", "view"),
 }
@@ -102,6 +103,10 @@ def loop_row(loop: Loop) -> Row:
     return (*loop.a, *loop.b, T_a_b, cov, int(loop.inliers), loop.found_share)
 
 
+def arrival_row(key: KeyframeKey, unix_s: float) -> Row:
+    return *key, int(unix_s)
+
+
 def poses_row(poses: SavePoses) -> Row:
     keys = [(*key, name) for key, name in zip(poses.keys, poses.map_ids, strict=True)]
     return _pack(keys), _encode_array(poses.T_map_body)
@@ -156,6 +161,12 @@ def read_loop(row: Row) -> Loop:
     return Loop(
         _checked_key(a, a_id), _checked_key(b, b_id), _decode_pose(T), _decode_cov(cov), inliers, found_at
     )
+
+
+def read_arrival(row: Row) -> tuple[KeyframeKey, int]:
+    """Return a keyframe and when it came, unix s."""
+    agent, id, unix_s = row
+    return _checked_key(agent, id), _checked_int(unix_s)
 
 
 def read_image(row: Row) -> tuple[KeyframeKey, U8]:

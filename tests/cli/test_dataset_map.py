@@ -21,7 +21,7 @@ def room(tmp_path):
 @pytest.mark.long
 def test_info(room):
     text = good("info", room)
-    assert text.startswith("room.sqlite: map, schema 5, 0.3 MB\n")
+    assert text.startswith("room.sqlite: map, schema 5, 0.4 MB\n")
     assert "  bob        ar         20 keyframes, 0 removed\n" in text
     assert "  map ann-0001/0: 40 keyframes\n" in text
     assert "  5 loops, 40 keyframes in the latest solution\n" in text

@@ -165,5 +165,5 @@ def test_the_wait_restarts_when_a_merge_is_undone_and_made_again(
 def test_segments_without_keyframes_are_forgotten() -> None:
     gate = LocalisationGate(0.05)
     gate.restore(2, 0)
-    gate.forget([2])
+    gate.forget_all_but([0, 1])
     assert not gate.is_published(2, 0)

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 from helpers.children import Child
 from helpers.crowd import crowd
-from helpers.map_changes import small_map
+from helpers.map_changes import ANN, keyframe, small_map
 
+from share.store import map_store
 from share.store.map_store import MapStore
 from share.store.rows import insert
 from share.store.schema import SCHEMA
@@ -188,3 +189,35 @@ def test_a_map_file_that_is_moved_away_meanwhile(tmp_path, how):
     with MapStore.open(path) as store:
         numbers = [k.keyframe_key.id for k in store.load().keyframes]
     assert numbers == list(range(ann.machine.report()["keyframes"]))
+
+
+# ---------------------------------------------------------------- how long it is kept
+
+
+@pytest.mark.long
+def test_keyframes_that_are_too_old_leave_the_file_when_the_edge_starts(tmp_path, monkeypatch):
+    now_s = time.time()
+    monkeypatch.setattr(map_store.time, "time", lambda: now_s - 31 * 86_400)
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write(small_map())
+    mark = keyframe(ANN, 7).keyframe.image.jpeg.tobytes()
+    assert mark in (tmp_path / "room.sqlite").read_bytes()
+    (tmp_path / "edge.yaml").write_text("edge: {keep_days: 30}\n")
+    where = "--map", str(tmp_path / "room.sqlite"), "--out", str(tmp_path / "out")
+    child = Child(
+        tmp_path / "edge.log",
+        "edge",
+        "--bind",
+        "tcp://127.0.0.1:0",
+        "--config",
+        str(tmp_path / "edge.yaml"),
+        *where,
+    )
+    child.wait_for("40 keyframes forgotten, 0 stay: older than 30 days")
+    assert child.interrupt() == 0
+    events = (tmp_path / "out" / "events.jsonl").read_text()
+    assert events.count('"expired"') == 1
+    for file in tmp_path.glob("room.sqlite*"):
+        assert mark not in file.read_bytes()
+    kept = MapStore.read(tmp_path / "room.sqlite").load()
+    assert (kept.runs, kept.keyframes, kept.loops, kept.problems) == ((), (), (), ())

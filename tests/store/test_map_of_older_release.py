@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from helpers.recorded_traffic import VERSIONS, map_file
 
 from share.errors import StoreError
 from share.protocol.peer import restored_runs
-from share.store import rows
+from share.store import rows, schema
 from share.store.map_store import MapStore
 from share.wire.codec import WIRE_VERSION
 
@@ -28,6 +29,38 @@ def test_a_map_of_an_older_release_is_opened_and_continued(old: int, tmp_path: P
         assert {run.key: run.next_keyframe for run in restored_runs(kept, 0.03)} == ends
     finally:
         store.close()
+
+
+def test_a_map_of_an_older_schema_is_converted(old: int, tmp_path: Path) -> None:
+    path = map_file(old, tmp_path)
+    assert MapStore.read(path).schema == 3
+    assert {found.came_s for found in MapStore.read(path).load().keyframes} == {None}
+    opened_s = int(time.time())
+    with MapStore.open(path) as store:
+        assert store.schema == schema.SCHEMA
+        assert store.load().problems == ()
+        assert len(store.load().keyframes) == 16
+    converted = MapStore.read(path)
+    assert converted.load().problems == ()
+    times = {found.came_s for found in converted.load().keyframes}
+    assert all(came_s is not None and 0 <= came_s - opened_s < 60 for came_s in times)
+
+
+def test_reading_an_older_schema_leaves_the_file_as_it_is(old: int, tmp_path: Path) -> None:
+    path = map_file(old, tmp_path)
+    before = path.read_bytes()
+    assert len(MapStore.read(path).load().keyframes) == 16
+    assert path.read_bytes() == before
+
+
+def test_a_damaged_map_of_an_older_schema_is_salvaged(old: int, tmp_path: Path) -> None:
+    path = map_file(old, tmp_path)
+    data = bytearray(path.read_bytes())
+    data[:100] = bytes(100)  # its header
+    path.write_bytes(data)
+    with MapStore.open(path) as store:
+        assert store.schema == schema.SCHEMA
+        assert len(store.load().keyframes) == 16
 
 
 def test_an_unreadable_map_is_refused_in_one_line(

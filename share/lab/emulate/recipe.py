@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from share.lab.emulate.sensor.effects import Effects
 GENERATOR_VERSION = 2
 SENSORS = ("stereo", "rgbd", "mono")
 IMAGES = ("jpeg", "png")
+MAX_DAY = 10**6
 # depths at which a recording's folder has text files, as FOLDER/mav0/imu0/data.csv
 _FOLDER_DEPTHS, _TEXT_SUFFIXES = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")
 
@@ -32,8 +34,10 @@ def no_progress(what: str, done: int, total: int) -> None:
 @dataclass(frozen=True)
 class SessionRecipe:
     """scene: a name, or a glTF file. motions: `[NAME=]SPEC` each. size: of the room, m; None: the scene's
-    default. sensors, profiles: one for all (key "") or by an agent's name; profiles may name a mode, as
-    `d435i:848x480@30`. images: jpeg has quality 95; png is lossless. Raises UsageError for an invalid recipe.
+    default. day: 0 for the room as it is furnished, else the same room on another day, with other paths and
+    noise (`share.lab.emulate.world.another_day`). sensors, profiles: one for all (key "") or by an agent's
+    name; profiles may name a mode, as `d435i:848x480@30`. images: jpeg has quality 95; png is lossless.
+    Raises UsageError for an invalid recipe.
     """
 
     scene: str
@@ -45,6 +49,7 @@ class SessionRecipe:
     profiles: dict[str, str] = field(default_factory=dict)
     effects: Effects = field(default_factory=Effects)
     images: str = "jpeg"
+    day: int = 0
 
     def __post_init__(self) -> None:
         if not 3 <= self.seconds <= 3600:
@@ -54,6 +59,8 @@ class SessionRecipe:
         for sensors in self.sensors.values():
             if sensors not in SENSORS:
                 raise UsageError(f"sensors '{sensors}' are not known; known: {', '.join(SENSORS)}")
+        if not 0 <= self.day <= MAX_DAY:
+            raise UsageError(f"day {self.day}: must be 0 .. {MAX_DAY}")
         if self.images not in IMAGES:
             raise UsageError(f"images '{self.images}' are not known; known: {', '.join(IMAGES)}")
 
@@ -61,7 +68,14 @@ class SessionRecipe:
         """Return plain data for session.yaml."""
         out = asdict(self) | {"motions": list(self.motions), "generator_version": GENERATOR_VERSION}
         out["size"] = None if self.size is None else list(self.size)
+        if not self.day:
+            del out["day"]  # sessions that were made before there were days keep their digest
         return out
+
+    @property
+    def motion_seed(self) -> int:
+        """Return the seed of what differs from day to day: paths and noise."""
+        return self.seed if not self.day else zlib.crc32(f"{self.seed} day {self.day}".encode())
 
     @property
     def digest(self) -> str:

@@ -159,7 +159,7 @@ def prepare_session(recipe: SessionRecipe, room: Path, progress: Progress) -> Pr
     """
     progress("planning", 0, 1)
     _check_first(recipe)
-    motion_plan = plan_motions(recipe.motions, make_layout(recipe), recipe.seconds, recipe.seed)
+    motion_plan = plan_motions(recipe.motions, make_layout(recipe), recipe.seconds, recipe.motion_seed)
     _check_names(recipe, motion_plan)
     actors = tuple(_make_actor(agent, k, recipe) for k, agent in enumerate(motion_plan.agents))
     _check_lenses(recipe, actors)
@@ -180,15 +180,18 @@ def keep_room(prepared: PreparedSession, progress: Progress) -> None:
 
 def make_layout(recipe: SessionRecipe) -> Layout:
     """Return the room's layout. Raises UsageError for an unknown scene or an unsupported size."""
+    if recipe.day and (recipe.scene == PLAIN or recipe.scene.lower().endswith(_GLTF_SUFFIXES)):
+        raise UsageError(f"{recipe.scene}: what is loose in it is not known; leave out --day")
     if recipe.scene == PLAIN:
         from share.lab.emulate.plain.render import plain_layout
 
         return plain_layout(recipe.seed, recipe.size)
     if recipe.scene.lower().endswith(_GLTF_SUFFIXES):
         return _gltf_layout(recipe)
+    from share.lab.emulate.world.another_day import another_day
     from share.lab.emulate.world.scenes import make_scene_layout
 
-    return make_scene_layout(recipe.scene, recipe.seed, recipe.size)
+    return another_day(make_scene_layout(recipe.scene, recipe.seed, recipe.size), recipe.day)
 
 
 def _gltf_layout(recipe: SessionRecipe) -> Layout:
@@ -205,9 +208,11 @@ def _make_actor(agent: PlannedAgent, number: int, recipe: SessionRecipe) -> Acto
     rig = _recorded_rig(device_profile.rig(depth=sensors == _DEPTH), agent)
     if sensors == _MONO:
         rig = replace(rig, cam1=None, T_cam1_cam0=None)
-    seed = (recipe.seed, 7, number)
+    seed = (recipe.motion_seed, 7, number)
     path = _imu_path(agent, rig)
-    device = EmulatedDevice(device_profile, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))
+    device = EmulatedDevice(
+        device_profile, recipe.effects, seed, agent.path.start_ns, (recipe.motion_seed, 8)
+    )
     pictures = _without_gaps(device.picture_times(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
     if len(pictures) < 2:
         raise UsageError(f"{agent.name}: {agent.spec} leaves {len(pictures)} pictures; give it more time")

@@ -23,14 +23,18 @@ from share.lab.evaluate.emulated_network import Channel, NetworkModel
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import StoredMap
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
-from share.mapping.steps import AlignStep, DescribeStep, QueryStep, VerifyStep
+from share.mapping.steps import AlignStep, DescribeStep, IndexStep, QueryStep, VerifyStep
 from share.metrics.frame_log import RunLog
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
 from share.protocol.edge import Edge
+from share.protocol.peer import restored_runs
+from share.store.keyframe_archive import KeyframeArchive
+from share.store.map_store import MapStore
 from share.types import F64, KeyframeCandidate, TrackState
 from share.wire.codec import Bytes, message_bytes
 from share.wire.messages import Hello, peer_id
@@ -76,7 +80,8 @@ class ProcessingDelays:
     Agent: `frame`: from a frame to its published pose; `keyframe`: from there until its keyframe may be sent;
     `finish_keyframe`: slice of keyframe work that may follow any frame. Edge: `receive`: a message at the
     front; the rest: steps of mapper and solver. Those of images (`describe`, `align_*`, `verify_images_*`)
-    were measured as CPU time in two emulated sessions of 640x480 px, 222 to 1,539 steps each.
+    were measured as CPU time in two emulated sessions of 640x480 px, 222 to 1,539 steps each; `index` for 16
+    random views of 800 features, with their insertion.
     """
 
     frame: Delay = Delay(4.3, 5.4)
@@ -88,6 +93,7 @@ class ProcessingDelays:
     verify_accepted: Delay = Delay(4.0, 6.0)
     verify_refused: Delay = Delay(2.0, 5.0)
     describe: Delay = Delay(5.8, 8.1)
+    index: Delay = Delay(11.0, 33.0)
     align_accepted: Delay = Delay(12.4, 17.3)
     align_refused: Delay = Delay(1.7, 7.3)
     verify_images_accepted: Delay = Delay(19.2, 27.1)
@@ -126,9 +132,11 @@ class Simulation:
         mapper: Mapper | None = None,
         on_effect: Callable[[str, ev.AgentEffect], None] = lambda name, effect: None,
         on_record: Callable[[dict[str, Any]], None] = lambda fields: None,
+        store: MapStore | None = None,
     ) -> None:
         """Take each agent's hello, frames and network. `mapper`: a real one by default, or a
-        model with its interface.
+        model with its interface. `store`: a map that the edge continues and keeps, as with `--map`; writing
+        takes no time.
 
         `on_effect(name, effect)` is called for every effect of an agent, `on_record(fields)` for every event
         that the edge records.
@@ -148,8 +156,14 @@ class Simulation:
             member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
             self._members[member.peer] = member
             self._schedule_next_frame(member)
-        self.edge = Edge(config, session=1)
-        self.mapper = Mapper(config) if mapper is None else mapper
+        kept = StoredMap() if store is None else store.load()
+        restored = restored_runs(kept, config.merge.enter_m)
+        self._store = store
+        self.edge = Edge(config, session=1, has_store=store is not None, restored=restored)
+        archive = None if store is None else KeyframeArchive(store.path)
+        self.mapper = Mapper(config, archive) if mapper is None else mapper
+        if kept.runs:
+            self.mapper.restore(kept)
         self._solver = PoseGraphSolver()
         self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
         self._is_busy = False  # the mapper process
@@ -242,8 +256,11 @@ class Simulation:
             match effect:
                 case ed.SendToPeer():
                     self._send_down(effect)
-                case ed.AddRun() | ed.SetPresence() | ed.AddKeyframe():
+                case ed.AddRun() | ed.SetPresence() | ed.AddKeyframe() | ed.DropRun():
                     self._send_to_mapper(self._delays.add, partial(self._apply_to_mapper, effect))
+                case ed.SaveChanges() if self._store is not None:
+                    self._store.write(effect.changes)
+                    self._to_edge(ed.ChangesSaved(effect.ticket))
                 case ed.WriteEvent():
                     self._on_record(effect.fields)
 
@@ -254,12 +271,16 @@ class Simulation:
             arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
         )
 
-    def _apply_to_mapper(self, message: ed.AddRun | ed.SetPresence | ed.AddKeyframe) -> list[MapEvent]:
+    def _apply_to_mapper(
+        self, message: ed.AddRun | ed.SetPresence | ed.AddKeyframe | ed.DropRun
+    ) -> list[MapEvent]:
         if isinstance(message, ed.AddKeyframe):
             self.stamps_ns[KeyframeKey(message.key, message.keyframe.id)] = message.keyframe.stamp_ns
             return self.mapper.add_keyframe(message.key, message.keyframe, message.is_over_rate)
         if isinstance(message, ed.SetPresence):
             self.mapper.set_present(message.key, message.is_present)
+        elif isinstance(message, ed.DropRun):
+            self.mapper.remove_run(message.key)
         else:
             self.mapper.add_run(message.key, message.hello)
         return []
@@ -316,6 +337,8 @@ class Simulation:
             return delays.query
         if step.kind == DescribeStep.kind:
             return delays.describe
+        if step.kind == IndexStep.kind:
+            return delays.index
         verified, refused = delays.verify_accepted, delays.verify_refused
         if step.kind == AlignStep.kind:
             verified, refused = delays.align_accepted, delays.align_refused

@@ -67,7 +67,7 @@ def play_in_virtual_time(
         )
     error_source = _TRUE_ERROR if options.true_error else settings.agent.error_model
     tracker_settings = settings.tracker, settings.inertial, settings.sequencer
-    tracked = _track_all(session.folder.resolve(), *tracker_settings, error_source)
+    tracked = track_session(session.folder.resolve(), *tracker_settings, error_source)
     links = LinkAssignment.parse(options.link)
     links.check(session.agents)
     start_ns = min(frames[0].arrival_ns for _, frames in tracked.values() if frames)
@@ -96,7 +96,7 @@ def play_in_virtual_time(
 
 
 @lru_cache(maxsize=1)  # policies follow each other on one session
-def _track_all(
+def track_session(
     folder: Path,
     tracker: TrackerConfig,
     inertial: InertialConfig,
@@ -206,7 +206,7 @@ _DEFAULT_DELAYS = ProcessingDelays()
 _SMALL_STEPS = "receive", "add", "check_loop", "apply_solution"
 _ALIGN = "align_accepted", "align_refused"
 _VERIFY_IMAGES = "verify_images_accepted", "verify_images_refused"
-_IMAGE_STEPS = "describe", *_ALIGN, *_VERIFY_IMAGES
+_IMAGE_STEPS = "describe", "index", *_ALIGN, *_VERIFY_IMAGES
 
 
 def read_delays(run: Path) -> ProcessingDelays:

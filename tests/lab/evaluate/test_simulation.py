@@ -14,7 +14,7 @@ from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simu
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
-from share.mapping.steps import AlignStep, DescribeStep, LookupStep, QueryStep, VerifyStep
+from share.mapping.steps import AlignStep, DescribeStep, IndexStep, LookupStep, QueryStep, VerifyStep
 from share.types import KeyframeImage, View
 
 pytestmark = pytest.mark.long
@@ -107,6 +107,7 @@ def test_an_agent_receives_its_rate() -> None:
     ("step", "accepted", "refused"),
     [
         (DescribeStep(0, IMAGE), "describe", "describe"),
+        (IndexStep(0, PlaceIndex(), ()), "index", "index"),
         (QueryStep(PlaceIndex(), 0, LOOKS, 5, ()), "query", "query"),
         (AlignStep(0, IMAGE, 1, IMAGE, np.eye(4)), "align_accepted", "align_refused"),
         (VerifyStep(0, LOOKS, 1, LOOKS), "verify_accepted", "verify_refused"),

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from share.lab.emulate.types import Mesh
 from share.lab.emulate.world.materials import GivenMaterial, Material
-from share.types import F64
+from share.types import F64, I64
 
 Rng = np.random.Generator
 
@@ -80,6 +80,14 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
         layer=np.concatenate([m.layer for m in meshes]),
         faces=np.concatenate([m.faces + np.int32(k) for m, k in zip(meshes, first, strict=False)]),
     )
+
+
+def with_faces(shape: Shape, faces: I64) -> Shape:
+    """Return the shape with only these triangles, by index (F,), and their corners."""
+    mesh = shape.mesh
+    used, number = np.unique(mesh.faces[faces], return_inverse=True)
+    columns = {name: getattr(mesh, name)[used] for name in ("vertices", "normals", "uv", "layer")}
+    return replace(shape, mesh=Mesh(**columns, faces=number.reshape(-1, 3).astype(np.int32)))
 
 
 def quad(
