@@ -6,6 +6,7 @@ import json
 import re
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,13 +63,14 @@ def forget(map_file: Path, agents: tuple[str, ...], age_s: float | None, yes: bo
     if not map_file.is_file():
         raise UsageError(f"{map_file}: no such file")
     before_s = None if age_s is None else time.time() - age_s
-    with Stages() as stages:
-        stages("reading the map", 0, 1)
-        store = MapStore.open(map_file)
-    with store:
-        for complaint in store.problems:
-            print_note(str(map_file), complaint)
-        plan = Forgetting(store, agents or None, before_s)
+    with ExitStack() as stack:
+        with Stages() as stages:
+            stages("reading the map", 0, 1)
+            store = stack.enter_context(MapStore.open(map_file))
+            for complaint in store.problems:
+                print_note(str(map_file), complaint)
+            stages("planning", 0, 1)
+            plan = Forgetting(store, agents or None, before_s)
         if plan.report.deleted_keyframes:
             _confirm(map_file, plan.report, yes)
         with Stages() as stages:

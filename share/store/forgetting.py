@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass, replace
@@ -49,12 +50,23 @@ class Forgetting:
         self.report = _report(store, kept, self._plan)
 
     def carry_out(self) -> None:
-        """Delete, and rewrite the file without what was deleted. Raises StoreError if the disk is full or
+        """Delete, and rewrite the file without what was deleted. Raises StoreError if the disk is too full or
         fails."""
+        _check_space(self._store.path)
         self._store.write(self._plan.changes)
         self._store.compact()
         copies = tuple(map(str, damaged_copies(self._store.path)))  # a repair makes one
         self.report = replace(self.report, copies=copies)
+
+
+def _check_space(path: Path) -> None:
+    """Raises StoreError where the file cannot be rewritten, which takes its size twice more for a while."""
+    need, free = 2 * path.stat().st_size, shutil.disk_usage(path.parent).free
+    if need > free:
+        raise StoreError(
+            f"{path}: nothing was deleted: rewriting it takes {need / 1e6:.0f} MB, "
+            f"and {free / 1e6:.0f} MB are free"
+        )
 
 
 def damaged_copies(path: Path) -> list[Path]:

@@ -8,12 +8,14 @@ import stat
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.map_changes import ANN, BOB, keyframe, loop, run, small_map, solution
 
 from share.config import Config
+from share.errors import StoreError
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import (
     MapChange,
@@ -26,7 +28,7 @@ from share.mapping.map_changes import (
     map_poses,
 )
 from share.mapping.mapper import Mapper
-from share.store import map_store
+from share.store import forgetting, map_store
 from share.store.forgetting import Forgetting, ForgettingReport
 from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore
@@ -114,9 +116,9 @@ def bytes_on_disk(path: Path) -> bytes:
 
 def forget(path: Path, *agents: str, before_s: float | None = None) -> ForgettingReport:
     with MapStore.open(path) as store:
-        forgetting = Forgetting(store, agents or None, before_s)
-        forgetting.carry_out()
-    return forgetting.report
+        planned = Forgetting(store, agents or None, before_s)
+        planned.carry_out()
+    return planned.report
 
 
 def test_no_byte_of_a_forgotten_agent_stays(path: Path) -> None:
@@ -268,6 +270,16 @@ def test_a_reader_delays_the_wipe_and_does_not_prevent_it(path: Path) -> None:
         reader.close()
         store.write([SaveLoop(loop(0, 0))])
         assert marker(ANN, 3) not in bytes_on_disk(path)
+
+
+def test_nothing_is_deleted_where_the_file_cannot_be_rewritten(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(path, small_map())
+    monkeypatch.setattr(forgetting.shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+    with pytest.raises(StoreError, match="nothing was deleted: rewriting it takes"):
+        forget(path, "ann")
+    assert len(loaded(path).keyframes) == 40
 
 
 def test_damaged_copies_are_named(path: Path) -> None:

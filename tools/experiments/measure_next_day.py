@@ -8,10 +8,9 @@
 Plays FIRST in virtual time against an edge with an empty map file, ends the edge, and plays SECOND, new runs
 of the same agents, against a new edge with that file. Prints a Markdown table.
 
-Truth of the saved map: one alignment (SE3) of its keyframes to the world. An agent is *located* from its
-first pose in the saved map on, *in view* from its first frame nearer than 1 m and 30 degrees to a saved
-keyframe; its error is that of each pose in the saved map under that alignment, *wrong* beyond 0.5 m or 10
-degrees.
+Truth of a saved map: one alignment (SE3) of its keyframes to the world. An agent is *located* from its first
+pose in a saved map on, *in view* from its first frame nearer than 1 m and 30 degrees to a saved keyframe; its
+error is that of each pose in a saved map under that map's alignment, *wrong* beyond 0.5 m or 10 degrees.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -34,7 +33,7 @@ from tool_main import exit_code, line  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.geometry.interpolation import associate  # noqa: E402
+from share.geometry.interpolation import associate, interpolate  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
 from share.lab.evaluate.simulation import ProcessingDelays, Simulation  # noqa: E402
 from share.lab.evaluate.virtual_time import track_session  # noqa: E402
@@ -53,8 +52,8 @@ _DRAIN_S = 2.0
 
 @dataclass(frozen=True)
 class NextDay:
-    """One agent on the second day. Times in s since its first pose; None: never. Errors of its poses in the
-    saved map."""
+    """One agent on the second day. Times in s since its first pose; None: never. Errors of its poses in
+    saved maps."""
 
     sessions: str
     agent: str
@@ -66,6 +65,7 @@ class NextDay:
     max_deg: float | None
     wrong_s: float
     in_map_s: float
+    saved_maps: int
     saved_cm: float
     saved_keyframes: int
     saved_left: int
@@ -94,18 +94,33 @@ def play(session: Session, store: MapStore, first_run: int) -> Simulation:
     return world
 
 
-def true_keyframes(session: Session, kept: StoredMap) -> tuple[str, F64, F64]:
-    """Name of the largest map, and its keyframes' poses (N, 4, 4) in the map and in the world."""
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """Keyframes of a saved map, and its alignment T_world_map (4, 4). T_world (N, 4, 4): their true poses."""
+
+    T_world_map: F64
+    T_world: F64
+    errors_m: F64
+
+
+def saved_maps(session: Session, kept: StoredMap) -> dict[str, SavedMap]:
+    """Maps of the file by name, those of at least three keyframes with a truth."""
     poses, names = map_poses(kept), {run.run_key: run.hello.name for run in kept.runs}
-    maps = [name for name, _ in poses.values()]
-    largest = max(set(maps), key=maps.count)
-    found = []
-    for run, name in names.items():
-        own = [k for k in kept.keyframes if k.run_key == run and poses[k.keyframe_key][0] == largest]
-        stamps = np.array([k.keyframe.stamp_ns for k in own], np.int64)
-        T = np.array([poses[k.keyframe_key][1] for k in own]).reshape(-1, 4, 4)
-        found.append(associate((stamps, T), read_tum(session.folder / "truth" / f"{name}.tum"))[1:])
-    return largest, np.concatenate([m for m, _ in found]), np.concatenate([w for _, w in found])
+    truths = {name: read_tum(session.folder / "truth" / f"{name}.tum") for name in session.agents}
+    out = {}
+    for map_id in dict.fromkeys(name for name, _ in poses.values()):
+        pairs = []
+        for run, name in names.items():
+            own = [k for k in kept.keyframes if k.run_key == run and poses[k.keyframe_key][0] == map_id]
+            stamps = np.array([k.keyframe.stamp_ns for k in own], np.int64)
+            T = np.array([poses[k.keyframe_key][1] for k in own]).reshape(-1, 4, 4)
+            pairs.append(associate((stamps, T), truths[name])[1:])
+        T_map, T_world = (np.concatenate(side) for side in zip(*pairs, strict=True))
+        if len(T_map) >= 3:
+            T_world_map = se3.umeyama(T_map[:, :3, 3], T_world[:, :3, 3])
+            errors_m = np.linalg.norm((T_world_map @ T_map)[:, :3, 3] - T_world[:, :3, 3], axis=1)
+            out[map_id] = SavedMap(T_world_map, T_world, errors_m)
+    return out
 
 
 def measure(first: Path, second: Path) -> list[NextDay]:
@@ -116,54 +131,55 @@ def measure(first: Path, second: Path) -> list[NextDay]:
             play(read_session(first), store, 1)
         with MapStore.open(path) as store:
             kept = store.load()
-            saved, T_map, T_world = true_keyframes(read_session(first), kept)
-            T_world_map = se3.umeyama(T_map[:, :3, 3], T_world[:, :3, 3])
+            maps = saved_maps(read_session(first), kept)
             world = play(read_session(second), store, 101)
             later = {k.keyframe_key for k in store.load().keyframes}
-    errors = np.linalg.norm((T_world_map @ T_map)[:, :3, 3] - T_world[:, :3, 3], axis=1)
-    saved_cm = 100 * float(np.sqrt(np.mean(errors**2)))
+    saved_cm = 100 * float(np.sqrt(np.mean(np.concatenate([one.errors_m for one in maps.values()]) ** 2)))
     left = sum(k.keyframe_key in later for k in kept.keyframes)
-    common = saved_cm, len(kept.keyframes), left
+    common = len(maps), saved_cm, len(kept.keyframes), left
     pair = f"{first.name} {second.name}"
     return [
-        NextDay(pair, name, *_placement(poses, second, name, saved, T_world_map, T_world), *common)
+        NextDay(pair, name, *_placement(poses, second, name, maps), *common)
         for name, poses in world.localised.items()
     ]
 
 
 def _placement(
-    poses: Sequence[LocalisedPose], session: Path, name: str, saved: str, T_world_map: F64, T_saved: F64
+    poses: Sequence[LocalisedPose], session: Path, name: str, maps: Mapping[str, SavedMap]
 ) -> tuple[float | None, float | None, float | None, float | None, float | None, float | None, float, float]:
     """Fields of `NextDay` from `seen_s` to `in_map_s`."""
-    stamps = np.array([p.stamp_ns for p in poses], np.int64)
-    T_est = np.array([T_world_map @ p.T_map_odom @ p.T_odom_body for p in poses])
     truth = read_tum(session / "truth" / f"{name}.tum")
-    known_ns, T_est, T_true = associate((stamps, T_est), truth)
-    in_saved = np.array([p.map_id == saved for p in poses])[np.isin(stamps, known_ns)]
-    since_s = (known_ns - known_ns[0]) * 1e-9
-    shift, angle = se3.pairwise_distances(T_true, T_saved)
+    stamps = np.array([p.stamp_ns for p in poses], np.int64)
+    known, T_true = interpolate(*truth, stamps)
+    kept = [p for p, is_known in zip(poses, known, strict=True) if is_known]
+    since_s = (stamps[known] - stamps[known][0]) * 1e-9
+    shift, angle = se3.pairwise_distances(T_true, np.concatenate([one.T_world for one in maps.values()]))
     seen = np.flatnonzero(((shift < SEEN_M) & (angle < SEEN_RAD)).any(axis=1))
     seen_s = float(since_s[seen[0]]) if len(seen) else None
-    if not in_saved.any():
+    located = np.array([p.map_id in maps for p in kept])
+    if not located.any():
         return seen_s, None, None, None, None, None, 0.0, 0.0
-    error = se3.inverse(T_true[in_saved]) @ T_est[in_saved]
+    T_est = np.array(
+        [maps[p.map_id].T_world_map @ p.T_map_odom @ p.T_odom_body for p in kept if p.map_id in maps]
+    )
+    error = se3.inverse(T_true[located]) @ T_est
     metres, turn = np.linalg.norm(error[:, :3, 3], axis=1), se3.rotation_angle(error[:, :3, :3])
     period_s = float(np.median(np.diff(since_s)))
     return (
         seen_s,
-        float(since_s[in_saved][0]),
+        float(since_s[located][0]),
         100 * float(metres[0]),
         100 * float(np.median(metres)),
         100 * float(metres.max()),
         float(np.degrees(turn.max())),
         period_s * int(((metres > WRONG_M) | (turn > WRONG_RAD)).sum()),
-        period_s * int(in_saved.sum()),
+        period_s * int(located.sum()),
     )
 
 
 _TITLES = (
     *("sessions", "agent", "in view s", "located s", "at first cm", "median cm", "max cm", "max deg"),
-    *("wrong s", "in map s", "saved map cm", "its keyframes", "left"),
+    *("wrong s", "in map s", "saved maps", "their cm", "their keyframes", "left"),
 )
 
 
