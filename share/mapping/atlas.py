@@ -202,6 +202,7 @@ class Atlas:
         """
         graph, removed = self.graph, list[RemovedKeyframe]()
         before, is_removed = list(graph.reference_segments), set(node_ids)
+        self.culling.start_over()
         for segment in list(graph.odometry.live_segments):
             nodes = graph.odometry.segments[segment].nodes
             if is_removed.issuperset(nodes):

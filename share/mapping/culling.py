@@ -63,6 +63,10 @@ class KeyframeCulling:
         batch, self._due = self._due[:_REMOVED_PER_KEYFRAME], self._due[_REMOVED_PER_KEYFRAME:]
         return batch
 
+    def start_over(self) -> None:
+        """Forget what was chosen: keyframes were removed otherwise."""
+        self._search, self._due = None, []
+
     def _continue_search(self, search: InSlices[list[int]]) -> None:
         cost = 0
         try:

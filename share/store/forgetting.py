@@ -5,14 +5,13 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from share.errors import StoreError, UsageError
 from share.mapping.forgetting import ForgettingPlan, plan_forgetting
 from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
-from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore
 
 
@@ -48,7 +47,7 @@ class Forgetting:
         kept = store.load()
         _check_names(store.path, kept, agents)
         self._store, self._plan = store, plan_forgetting(kept, agents, before_s)
-        self.report = _report(kept, self._plan, damaged_copies(store.path), KeyframeArchive(store.path))
+        self.report = _report(store, kept, self._plan)
 
     def carry_out(self) -> None:
         """Delete, and rewrite the file without what was deleted. Raises StoreError if the disk is too full or
@@ -56,6 +55,8 @@ class Forgetting:
         _check_space(self._store.path)
         self._store.write(self._plan.changes)
         self._store.compact()
+        copies = tuple(map(str, damaged_copies(self._store.path)))  # a repair makes one
+        self.report = replace(self.report, copies=copies)
 
 
 def _check_space(path: Path) -> None:
@@ -80,23 +81,18 @@ def _check_names(path: Path, kept: StoredMap, agents: Collection[str] | None) ->
         raise UsageError(f"{path}: has no agent '{unknown[0]}'; its agents: {listed}")
 
 
-def _report(
-    kept: StoredMap, plan: ForgettingPlan, copies: Iterable[Path], archive: KeyframeArchive
-) -> ForgettingReport:
+def _report(store: MapStore, kept: StoredMap, plan: ForgettingPlan) -> ForgettingReport:
     return ForgettingReport(
         len(plan.keyframes),
         _count_by_agent(kept, plan.keyframes),
         len(kept.loops) - plan.loops,
-        sum(
-            len(stored.keyframe.image.jpeg) or archive.jpeg_bytes(stored.keyframe_key)
-            for stored in plan.keyframes
-        ),
+        store.image_bytes(stored.keyframe_key for stored in plan.keyframes),
         len(plan.left),
         _count_by_agent(kept, plan.left),
         plan.loops,
         dict(Counter(plan.poses.map_ids)),
         len({name for name, _ in map_poses(kept).values()}),
-        tuple(map(str, copies)),
+        tuple(map(str, damaged_copies(store.path))),
     )
 
 

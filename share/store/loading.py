@@ -17,6 +17,7 @@ from share.mapping.keyframe_removal import reconnect
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink, SavePoses, StoredKeyframe, StoredMap, odometry_link
 from share.store import database, rows, schema
+from share.store.conversion import convert
 from share.store.database import DamageError, translate_errors
 from share.store.rows import Row
 from share.store.salvage import (
@@ -76,22 +77,15 @@ def _opened(read_rows: ReadRows) -> OpenedMap:
     return OpenedMap(read_rows, outline_map(read_rows).problems)
 
 
-_UNDATED = "SELECT run, id FROM keyframe WHERE (run, id) NOT IN (SELECT run, id FROM arrival) ORDER BY number"
-
-
 def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
-    """Open the writer's connection to a file that `load_and_repair` has checked; create missing tables.
-
-    Keyframes of an older schema, and those whose time of arrival was lost, count as arrived at now_s (unix
-    s)."""
+    """Open the writer's connection to a file that `read_and_repair` has checked; create or convert its
+    tables. now_s: unix s, see `convert`."""
     with translate_errors(path, "opened"):
         connection = database.open_for_writing(path, durable)
         connection.execute("BEGIN IMMEDIATE")
         if schema.is_empty(connection):
             schema.create(connection)
-        schema.convert(connection)
-        for run, id in connection.execute(_UNDATED).fetchall():
-            rows.insert(connection, "arrival", rows.arrival_row(KeyframeKey(run, id), now_s))
+        convert(connection, now_s)
         connection.execute("COMMIT")
     return connection
 
@@ -129,12 +123,11 @@ def _read_intact(path: Path) -> ReadRows:
             return ReadRows.empty()
         if not schema.matches_schema(connection):
             raise DamageError(f"{path}: the map is damaged: its tables")
-        tables = schema.own_tables(connection) - {*schema.LARGE_TABLES}
-        for table in sorted(tables):
+        for table in sorted(schema.own_tables(connection) - {*schema.LARGE_TABLES}):
             (verdict,) = connection.execute(f"PRAGMA integrity_check({table})").fetchone()
             if verdict != "ok":
                 raise DamageError(f"{path}: the map is damaged: {verdict}")
-        read_rows = read_intact_rows(connection, [t for t in rows.COLUMNS if t not in schema.LARGE_TABLES])
+        read_rows = read_intact_rows(connection, schema.SMALL_TABLES)
     if read_rows.is_damaged:
         raise DamageError(f"{path}: the map is damaged: its rows")
     return read_rows

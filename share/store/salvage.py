@@ -19,6 +19,7 @@ from share.files.reading import open_regular
 from share.files.sqlite_file import wal_path
 from share.files.writing import open_new, sync_folder, write_errors
 from share.store import database, rows, schema
+from share.store.conversion import move_images
 from share.store.database import DAMAGE_ERRORS
 from share.store.rows import COLUMNS, Row, insert, is_intact
 from share.store.schema import PAGE_BYTES, own_tables
@@ -56,16 +57,18 @@ def temporary_copy(path: Path, folder: Path | None = None) -> Iterator[Path]:
 
 def read_damaged(path: Path, folder: Path | None = None) -> ReadRows:
     """Read the intact rows of a damaged file, from a copy, as it is or with a new first page, whichever
-    yields more.
+    yields most.
 
-    The first page locates the tables. It is the same in all maps, except for counters.
+    The first page locates the tables. It is the same in all maps of a schema, except for counters.
     """
     with temporary_copy(path, folder) as copy:
-        unchanged = _read_copy(copy)
+        best = _read_copy(copy)
         wal_path(copy).unlink(missing_ok=True)
-        with write_errors(copy), copy.open("r+b") as file:
-            file.write(schema.first_page())
-        return max(unchanged, _read_copy(copy), key=ReadRows.row_count)
+        for version in (schema.SCHEMA, schema.OLDEST_SCHEMA):
+            with write_errors(copy), copy.open("r+b") as file:
+                file.write(schema.first_page(version))
+            best = max(best, _read_copy(copy), key=ReadRows.row_count)
+        return best
 
 
 def salvage(path: Path) -> tuple[ReadRows, Path]:
@@ -139,6 +142,8 @@ def _write_rows(read_rows: ReadRows, part: Path) -> None:
                 insert(connection, "about", rows.credential_row(run, credential))
         for statement in _DELETE_ORPHANS:
             connection.execute(statement)
+        if not read_rows.tables["image"]:  # the file may be of an older schema
+            move_images(connection)
         for segment in connection.execute(_SEGMENTS_WITHOUT_ROW).fetchall():
             insert(connection, "stretch", segment)
         connection.execute("COMMIT")

@@ -2,7 +2,7 @@
 
 Every row ends in a CRC-32 of its table's name and its other columns, so each can be checked alone. The table
 `about` is the same in all schemas: it holds the schema number. A newer schema only adds tables, so an older
-file is converted by creating them.
+file is converted by creating them (`share.store.conversion`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import sqlite3
 
 from share import __version__
-from share.store.rows import insert, is_intact
+from share.store.rows import COLUMNS, insert, is_intact
 
 SCHEMA = 5
 OLDEST_SCHEMA = 3  # that can be converted: SHARE 0.1.0's; 1 and 2 were never released
@@ -32,15 +32,16 @@ CREATE INDEX loop_b ON loop(b_run, b_id);
 CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc INTEGER)
 """  # noqa: E501
 _ADDED = {  # by schema; last in the file, so that page 1 of an older file differs in nothing else
-    4: "CREATE TABLE arrival(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, unix_s INTEGER, crc INTEGER,"
-    " UNIQUE(run, id))",
-    5: "CREATE TABLE image(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, jpeg BLOB, crc INTEGER,"
+    5: "CREATE TABLE arrival(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, unix_s INTEGER, crc INTEGER,"
+    " UNIQUE(run, id));\n"
+    "CREATE TABLE image(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, jpeg BLOB, crc INTEGER,"
     " UNIQUE(run, id));\n"
     "CREATE TABLE view(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, view BLOB, crc INTEGER,"
     " UNIQUE(run, id))",
 }
 ADDED_TABLES = ("arrival", "image", "view")  # which an older file lacks
 LARGE_TABLES = ("image", "view")  # whose rows are read when they are needed, not when the file is opened
+SMALL_TABLES = tuple(table for table in COLUMNS if table not in LARGE_TABLES)
 
 
 def _statements(version: int) -> list[str]:
@@ -56,15 +57,18 @@ def create(connection: sqlite3.Connection, version: int = SCHEMA) -> None:
         insert(connection, "about", (name, value))
 
 
-def convert(connection: sqlite3.Connection) -> None:
-    """Add what an intact file of an older schema lacks, within an open transaction."""
+def add_tables(connection: sqlite3.Connection) -> bool:
+    """Add the tables that an intact file of an older schema lacks, and set its number, within an open
+    transaction. Return whether it was one."""
     version = read_version(connection) or OLDEST_SCHEMA
+    if version == SCHEMA:
+        return False
     for statement in _statements(SCHEMA)[len(_statements(version)) :]:
         connection.execute(statement)
-    if version != SCHEMA:
-        (number,) = connection.execute("SELECT number FROM about WHERE name = 'schema'").fetchone()
-        connection.execute("DELETE FROM about WHERE number = ?", (number,))
-        insert(connection, "about", ("schema", str(SCHEMA)), number)
+    (number,) = connection.execute("SELECT number FROM about WHERE name = 'schema'").fetchone()
+    connection.execute("DELETE FROM about WHERE number = ?", (number,))
+    insert(connection, "about", ("schema", str(SCHEMA)), number)
+    return True
 
 
 def read_version(connection: sqlite3.Connection) -> int | None:
@@ -94,12 +98,12 @@ def is_empty(connection: sqlite3.Connection) -> bool:
     return not _objects(connection)
 
 
-def first_page() -> bytes:
-    """Return page 1 of a file of this schema: the header and the root page of each table.
+def first_page(version: int = SCHEMA) -> bytes:
+    """Return page 1 of a file of this schema number: the header and the root page of each table.
 
     The number of pages (bytes 28 to 31) is 0: SQLite then uses the file's length.
     """
-    page = bytearray(_template().serialize()[:PAGE_BYTES])
+    page = bytearray(_template(version).serialize()[:PAGE_BYTES])
     page[28:32] = bytes(4)
     return bytes(page)
 

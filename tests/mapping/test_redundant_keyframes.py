@@ -95,6 +95,16 @@ def test_ambiguous_places_are_forgotten_with_their_keyframes() -> None:
     assert atlas.loop_acceptance.ambiguous_nodes == {30}
 
 
+def test_after_forgetting_keyframes_no_redundant_one_of_before_is_removed() -> None:
+    ann, atlas = Walker("ann", 1, n=120), Atlas(CONFIG)
+    for keyframe in ann.keyframes:
+        atlas.add_keyframe("ann", keyframe)
+    assert len(atlas.culling.next_nodes(100)) == 2  # of 20 that were chosen
+    atlas.forget_keyframes(range(40))
+    assert len(atlas) == 80
+    assert atlas.culling.next_nodes(100) == []
+
+
 def test_without_its_first_keyframe_a_segment_begins_with_the_next() -> None:
     ann = Walker("ann", 1)
     graph = graph_of(ann)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import stat
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from share.mapping.map_changes import (
     RemoveKeyframes,
     SaveKeyframe,
     SaveLoop,
+    SaveView,
     StoredMap,
     Wipe,
     map_poses,
@@ -28,8 +30,11 @@ from share.mapping.map_changes import (
 from share.mapping.mapper import Mapper
 from share.store import forgetting, map_store
 from share.store.forgetting import Forgetting, ForgettingReport
+from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore
+from share.store.schema import PAGE_BYTES
 from share.types import KeyframeImage
+from share.vision.packed_view import PackedView
 
 CAROL = "carol-0003"
 DAY_S = 86_400
@@ -66,6 +71,29 @@ def three_agents(count: int = 20) -> list[MapChange]:
     loops = [*(loop(i, i) for i in range(0, count, 4)), *with_carol, *between]
     keys = [frame.keyframe_key for frame in frames]
     return [run(ANN), run(BOB), run(CAROL), *map(pictured, frames), *map(SaveLoop, loops), solution(keys)]
+
+
+def described(keys: tuple[str, ...] = (ANN, BOB, CAROL), count: int = 20) -> list[MapChange]:
+    """The views of these runs' keyframes."""
+    return [
+        SaveView(KeyframeKey(key, i), PackedView.pack(keyframe(key, i).keyframe.view))
+        for key in keys
+        for i in range(count)
+    ]
+
+
+def row_counts(path: Path, *tables: str) -> list[int]:
+    with closing(sqlite3.connect(path)) as connection:
+        return [connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0] for table in tables]
+
+
+def damage_images(path: Path) -> None:
+    """Overwrite the page that heads the table of images."""
+    with closing(sqlite3.connect(path)) as connection:
+        (page,) = connection.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'image'").fetchone()
+    with path.open("r+b") as file:
+        file.seek((page - 1) * PAGE_BYTES)
+        file.write(b"\xff" * PAGE_BYTES)
 
 
 def written(path: Path, changes: list[MapChange]) -> None:
@@ -108,10 +136,35 @@ def test_no_byte_of_a_forgotten_agent_stays(path: Path) -> None:
     assert report.image_bytes == 20 * IMAGE_BYTES
 
 
+def test_images_views_and_times_of_forgotten_keyframes_go_with_them(path: Path) -> None:
+    written(path, [*three_agents(), *described()])
+    tables = "keyframe", "arrival", "image", "view"
+    assert row_counts(path, *tables) == [60, 60, 60, 60]
+    descriptors = {key: keyframe(key, 7).keyframe.view.descriptors[:3].tobytes() for key in (ANN, BOB)}
+    forget(path, "ann")
+    assert row_counts(path, *tables) == [40, 40, 40, 40]
+    left = bytes_on_disk(path)
+    assert descriptors[ANN] not in left and descriptors[BOB] in left
+    assert KeyframeArchive(path).jpeg(KeyframeKey(ANN, 7)) is None
+    jpeg = KeyframeArchive(path).jpeg(KeyframeKey(BOB, 7))
+    assert jpeg is not None and marker(BOB, 7) in jpeg.tobytes()
+
+
+def test_where_the_images_are_damaged_the_copy_is_named(path: Path) -> None:
+    """Opening does not read them, so the damage is found while they are deleted."""
+    written(path, three_agents())
+    damage_images(path)
+    report = forget(path, "ann")
+    assert report.copies == (f"{path}.damaged-1",)
+    assert report.left_agents == {"bob": 20, "carol": 20}
+    assert row_counts(path, "keyframe", "arrival") == [40, 40]
+    assert b"ann" not in path.read_bytes()
+
+
 def test_what_was_culled_by_an_edge_that_did_not_overwrite_is_gone_too(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As edges before schema 4 left it: in free pages."""
+    """As edges before schema 5 left it: in free pages."""
     written(path, three_agents())
     with MapStore.open(path) as store:
         assert store._db is not None
@@ -190,6 +243,19 @@ def test_an_edge_that_removes_old_keyframes_overwrites_them(path: Path) -> None:
         left = bytes_on_disk(path)
     for i in range(20):
         assert marker(ANN, i) not in left
+
+
+def test_a_mapper_that_has_read_an_image_does_not_delay_the_wipe(path: Path) -> None:
+    archive = KeyframeArchive(path)
+    with MapStore.open(path) as store:
+        store.write([*three_agents(), *described()])
+        gone = KeyframeKey(ANN, 3)
+        assert archive.jpeg(gone) is not None and archive.view(gone) is not None
+        store.write([RemoveKeyframes((gone,)), Wipe()])
+        assert path.with_name("room.sqlite-wal").stat().st_size == 0
+        assert marker(*gone) not in bytes_on_disk(path)
+        assert archive.jpeg(gone) is archive.view(gone) is None
+        assert archive.has_jpeg(KeyframeKey(BOB, 3))
 
 
 def test_a_reader_delays_the_wipe_and_does_not_prevent_it(path: Path) -> None:

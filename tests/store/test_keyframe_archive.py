@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from helpers.map_changes import ANN, BOB, as_values, keyframe, run, small_map
@@ -13,10 +15,14 @@ from helpers.map_changes import ANN, BOB, as_values, keyframe, run, small_map
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveKeyframes, RemoveRun, SaveView, with_unknown_credentials
 from share.protocol.peer import restored_runs
+from share.store import rows
 from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore
-from share.store.schema import create
+from share.store.rows import insert
+from share.store.schema import SCHEMA, create
+from share.types import U8
 from share.vision.packed_view import PackedView
+from share.wire import codec
 
 KEY = KeyframeKey(ANN, 0)
 
@@ -108,6 +114,50 @@ def test_the_outline_continues_all_runs_as_the_whole_map_does(path: Path, has_po
         if first is not None and second is not None:
             assert first.map_id == second.map_id
             assert np.allclose(first.T_map_odom, second.T_map_odom, atol=1e-12)
+
+
+def write_schema_3(path: Path, count: int) -> None:
+    """A map of Ann's keyframes whose messages have the JPEGs."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("PRAGMA page_size = 8192")
+        create(connection, 3)
+        for table in ("run", "run_copy"):
+            insert(connection, table, rows.run_row(run(ANN), 0))
+        insert(connection, "stretch", (ANN, 0))
+        for i in range(count):
+            one = keyframe(ANN, i)
+            message = msgspec.msgpack.encode([bytes(frame) for frame in codec.encode(one.keyframe)])
+            insert(connection, "keyframe", (*rows.keyframe_row(one, 0, i)[:-1], message))
+
+
+def jpeg_bytes(found: U8 | None) -> bytes:
+    assert found is not None
+    return found.tobytes()
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_images_of_schema_3_move_to_their_table(path: Path, is_damaged: bool) -> None:
+    write_schema_3(path, 4)
+    sent = [keyframe(ANN, i).keyframe.image.jpeg.tobytes() for i in range(4)]
+    before = path.read_bytes()
+    found = MapStore.read(path).load().keyframes
+    assert [(k.keyframe.image.jpeg.tobytes(), k.came_s) for k in found] == [(jpeg, None) for jpeg in sent]
+    assert path.read_bytes() == before
+    if is_damaged:
+        path.write_bytes(bytes(100) + before[100:])
+    opened_s = int(time.time())
+    with MapStore.open(path) as store:
+        assert store.schema == SCHEMA
+        found = store.load().keyframes
+    assert len(store.problems) == 2 * is_damaged
+    assert [len(k.keyframe.image.jpeg) for k in found] == [0] * 4
+    assert [len(k.keyframe.image.uv) for k in found] == [3] * 4
+    assert all(k.came_s is not None and 0 <= k.came_s - opened_s < 60 for k in found)
+    assert [jpeg_bytes(KeyframeArchive(path).jpeg(KeyframeKey(ANN, i))) for i in range(4)] == sent
+    assert sent[2] not in b"".join(rows.keyframe_row(k, 0, 0)[-1] for k in found)
+    assert path.read_bytes().count(sent[2]) == 1
+    with MapStore.open(path) as store:
+        assert len(store.load().keyframes) == 4 and store.problems == ()
 
 
 def test_a_map_of_schema_3_is_read_as_it_is_and_converted_by_an_edge(path: Path) -> None:

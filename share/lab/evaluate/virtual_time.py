@@ -207,7 +207,7 @@ _DEFAULT_DELAYS = ProcessingDelays()
 _SMALL_STEPS = "receive", "add", "check_loop", "apply_solution"
 _ALIGN = "align_accepted", "align_refused"
 _VERIFY_IMAGES = "verify_images_accepted", "verify_images_refused"
-_IMAGE_STEPS = "describe", *_ALIGN, *_VERIFY_IMAGES
+_IMAGE_STEPS = "describe", "index", *_ALIGN, *_VERIFY_IMAGES
 
 
 def read_delays(run: Path) -> ProcessingDelays:

@@ -77,6 +77,7 @@ def test_where_nothing_was_described_or_aligned_both_are_in_proportion(tmp_path)
     assert some.align_accepted == Delay(2 * usual.align_accepted.p50, 2 * usual.align_accepted.p95)
     for name in (
         "describe",
+        "index",
         "align_accepted",
         "align_refused",
         "verify_images_accepted",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.edge_sim import Person, walls
@@ -14,7 +17,8 @@ from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simu
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
-from share.mapping.steps import AlignStep, DescribeStep, LookupStep, QueryStep, VerifyStep
+from share.mapping.steps import AlignStep, DescribeStep, IndexStep, LookupStep, QueryStep, VerifyStep
+from share.store.map_store import MapStore
 from share.types import KeyframeImage, View
 
 pytestmark = pytest.mark.long
@@ -24,10 +28,26 @@ IMAGE = ImageView(KeyframeImage.empty(), Camera(640, 480, 385.0, 385.0, 320.0, 2
 LOOKS = CameraView(View.empty(), 385.0, np.eye(4), np.zeros(3))
 
 
-def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs: Delay) -> Simulation:
+def world(
+    policy: str = "covins-g",
+    seed: int = 0,
+    seconds: float = 6.0,
+    store: MapStore | None = None,
+    day: int = 0,
+    **costs: Delay,
+) -> Simulation:
+    """store: a map that the edge continues. day: the runs of another day have other numbers."""
     people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)]
-    agents = [(person.hello, tracked_frames(person, seconds), NETWORK_PRESETS["wifi5"]) for person in people]
-    made = Simulation(Config(edge=EdgeConfig(policy=policy)), agents, ProcessingDelays(**costs), seed)
+    agents = [
+        (
+            replace(person.hello, run_id=person.hello.run_id + day),
+            tracked_frames(person, seconds),
+            NETWORK_PRESETS["wifi5"],
+        )
+        for person in people
+    ]
+    settings = Config(edge=EdgeConfig(policy=policy))
+    made = Simulation(settings, agents, ProcessingDelays(**costs), seed, store=store)
     made.run(seconds + 1.0)
     return made
 
@@ -62,6 +82,21 @@ def test_keyframe_work_after_a_frame_delays_the_next_one() -> None:
     assert max(track_ms(none, "ann")) < 5.1
     waits = np.diff(track_ms(always, "ann"))
     assert np.median(waits) == pytest.approx(35.0, abs=1.0)  # 85 ms each, every 50 ms
+
+
+def test_an_edge_continues_the_map_of_another_day(tmp_path: Path) -> None:
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        first = world(store=store)
+        store.write([first.mapper.current_poses()])
+    with MapStore.open(path) as store:
+        before = {k.keyframe_key for k in store.load().keyframes}
+        second = world(store=store, day=1)
+        after = {k.keyframe_key for k in store.load().keyframes}
+    assert len(before) == 48 and len(after) == 96 and before < after
+    report = second.edge.report(second.mapper.report())
+    assert report["failed_steps"] == 0 and report["index_ms"]["n"] == 3  # 48 views, 16 at once
+    assert list(second.mapper.report()["maps"].values()) == [96]
 
 
 def test_all_agents_are_tracked_and_corrected_in_one_map() -> None:
@@ -107,6 +142,7 @@ def test_an_agent_receives_its_rate() -> None:
     ("step", "accepted", "refused"),
     [
         (DescribeStep(0, IMAGE), "describe", "describe"),
+        (IndexStep(0, PlaceIndex(), ()), "index", "index"),
         (QueryStep(PlaceIndex(), 0, LOOKS, 5, ()), "query", "query"),
         (AlignStep(0, IMAGE, 1, IMAGE, np.eye(4)), "align_accepted", "align_refused"),
         (VerifyStep(0, LOOKS, 1, LOOKS), "verify_accepted", "verify_refused"),

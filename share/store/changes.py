@@ -1,0 +1,150 @@
+"""Changes of the map as SQL, within the caller's transaction."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Any
+
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import (
+    MapChange,
+    RemoveKeyframes,
+    RemoveLoops,
+    RemoveRun,
+    SaveCredential,
+    SaveKeyframe,
+    SaveLink,
+    SaveLoop,
+    SavePoses,
+    SaveRun,
+    SaveView,
+)
+from share.store import rows
+from share.store.rows import COLUMNS, insert
+
+_RUN_COLUMNS = (
+    *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
+    *(("loop", "a_run"), ("loop", "b_run"), ("arrival", "run"), ("image", "run"), ("view", "run")),
+)
+
+
+def apply_change(db: sqlite3.Connection, change: MapChange, now_s: float) -> None:
+    """Apply one change; again it changes nothing. now_s: unix s. Raises ValueError for a keyframe of an
+    unknown run."""
+    match change:
+        case SaveRun():
+            _insert_run(db, change)
+        case SaveCredential(run, credential):
+            _set_credential(db, run, credential)
+        case SaveKeyframe():
+            _insert_keyframe(db, change, now_s)
+        case SaveLink():
+            _delete_row(db, "link", change.key)
+            insert(db, "link", rows.link_row(change))
+        case SaveView():
+            _insert_view(db, change)
+        case SaveLoop():
+            _insert_loop(db, change)
+        case RemoveLoops(a, b):
+            for first, second in ((a, b), (b, a)):
+                db.execute(
+                    "DELETE FROM loop WHERE a_run = ? AND a_id = ? AND b_run = ? AND b_id = ?",
+                    (*first, *second),
+                )
+        case RemoveKeyframes():
+            for key in change.keys:
+                _remove_keyframe(db, key)
+        case RemoveRun():
+            _delete_run(db, change.run_key)
+        case SavePoses():
+            db.execute("DELETE FROM poses")
+            insert(db, "poses", rows.poses_row(change))
+
+
+def _insert_run(db: sqlite3.Connection, change: SaveRun) -> None:
+    if not first_row(db, "SELECT 1 FROM run WHERE key = ?", change.run_key):
+        for table in ("run", "run_copy"):
+            insert(db, table, rows.run_row(change, 0))
+        _set_credential(db, change.run_key, change.credential)
+
+
+def _set_credential(db: sqlite3.Connection, run: str, credential: str | None) -> None:
+    row = rows.credential_row(run, credential or "")
+    db.execute("DELETE FROM about WHERE name = ?", row[:1])
+    if credential and first_row(db, "SELECT 1 FROM run WHERE key = ?", run):
+        insert(db, "about", row)
+
+
+def _insert_keyframe(db: sqlite3.Connection, change: SaveKeyframe, now_s: float) -> None:
+    if change.keyframe_key.id < _next_id(db, change.run_key):
+        return
+    segment, ordinal = _segment_and_ordinal(db, change.run_key, starts_segment=change.keyframe.reference < 0)
+    insert(db, "keyframe", rows.keyframe_row(change, segment, ordinal))
+    insert(db, "arrival", rows.arrival_row(change.keyframe_key, now_s))
+    if len(jpeg := change.keyframe.image.jpeg):
+        insert(db, "image", rows.image_row(change.keyframe_key, jpeg))
+
+
+def _insert_view(db: sqlite3.Connection, change: SaveView) -> None:
+    _delete_row(db, "view", change.key)
+    if first_row(db, "SELECT 1 FROM keyframe WHERE run = ? AND id = ?", *change.key):
+        insert(db, "view", rows.view_row(change))
+
+
+def _segment_and_ordinal(db: sqlite3.Connection, run: str, starts_segment: bool) -> tuple[int, int]:
+    """Return the number of the run's newest segment, or of a new one, and the keyframe's position in it."""
+    (segment,) = first_row(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
+    if starts_segment or segment < 0:
+        insert(db, "stretch", (run, segment + 1))
+        return segment + 1, 0
+    newest = "SELECT stretch, ordinal FROM keyframe WHERE run = ? ORDER BY id DESC LIMIT 1"
+    previous_segment, ordinal = first_row(db, newest, run) or (-1, -1)
+    return segment, ordinal + 1 if previous_segment == segment else 0
+
+
+def _next_id(db: sqlite3.Connection, run: str) -> int:
+    """Return one more than the largest keyframe id that the run ever had."""
+    row = first_row(db, "SELECT next FROM run WHERE key = ?", run)
+    if not row:
+        raise ValueError(f"run {run} is not in the file; its SaveRun must come first")
+    (next_id,) = first_row(db, "SELECT ifnull(max(id) + 1, 0) FROM keyframe WHERE run = ?", run)
+    return max(int(row[0]), int(next_id))
+
+
+def _insert_loop(db: sqlite3.Connection, change: SaveLoop) -> None:
+    row = rows.loop_row(change.loop)
+    same = " AND ".join(f"{name} IS ?" for name in COLUMNS["loop"])
+    if not first_row(db, f"SELECT 1 FROM loop WHERE {same}", *row):
+        insert(db, "loop", row)
+
+
+def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
+    next_id = _next_id(db, key.agent)
+    for table in ("keyframe", "link", "arrival", "image", "view"):
+        _delete_row(db, table, key)
+    db.execute("DELETE FROM loop WHERE a_run = ? AND a_id = ?", key)
+    db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)
+    if _next_id(db, key.agent) < next_id:  # it was the newest: the remaining rows do not show its id
+        _store_next_id(db, key.agent, next_id)
+
+
+def _delete_run(db: sqlite3.Connection, run: str) -> None:
+    for table, column in _RUN_COLUMNS:
+        db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
+    _set_credential(db, run, None)
+
+
+def _store_next_id(db: sqlite3.Connection, run: str, next_id: int) -> None:
+    for table in ("run", "run_copy"):
+        number, codec, hello = first_row(db, f"SELECT number, codec, hello FROM {table} WHERE key = ?", run)
+        db.execute(f"DELETE FROM {table} WHERE number = ?", (number,))
+        insert(db, table, (run, next_id, codec, hello), number)
+
+
+def _delete_row(db: sqlite3.Connection, table: str, key: KeyframeKey) -> None:
+    db.execute(f"DELETE FROM {table} WHERE run = ? AND id = ?", key)
+
+
+def first_row(db: sqlite3.Connection, query: str, *values: Any) -> tuple[Any, ...]:
+    """Return the first row, or ()."""
+    return db.execute(query, values).fetchone() or ()
