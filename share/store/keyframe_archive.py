@@ -39,11 +39,6 @@ class KeyframeArchive:
     def has_view(self, key: KeyframeKey) -> bool:
         return bool(self._query("SELECT 1 FROM view WHERE run = ? AND id = ?", key))
 
-    def jpeg_bytes(self, key: KeyframeKey) -> int:
-        """The size of a keyframe's JPEG; 0 without one."""
-        found = self._query("SELECT length(jpeg) FROM image WHERE run = ? AND id = ?", key)
-        return found[0] if found and isinstance(found[0], int) else 0
-
     def _row(self, table: str, key: KeyframeKey) -> Row | None:
         columns = f"number, {', '.join(COLUMNS[table])}, crc"
         found = self._query(f"SELECT {columns} FROM {table} WHERE run = ? AND id = ?", key)
