@@ -88,8 +88,8 @@ class KeyframeLookup:
                 break
             if not {node_id, candidate} <= views.by_node.keys():
                 continue  # removed meanwhile
-            if (step := self._align_step(node_id, candidate)) is not None:
-                is_aligned |= yield from self._check(step, None)
+            if not self._is_gated(node_id, candidate):
+                is_aligned |= yield from self._check(self._align_step(node_id, candidate), None)
         return is_aligned
 
     def _query(self, node_id: int, is_aligned: bool) -> Job:
@@ -105,13 +105,10 @@ class KeyframeLookup:
         if node_id not in views:
             yield []
             return
+        is_recheck = node_id % _RECHECK_INTERVAL == 0
+        known = [candidate.id for candidate in found if candidate.id in views]
         by_map, by_looks = choose_checks(
-            self._atlas.graph,
-            node_id,
-            [candidate.id for candidate in found if candidate.id in views],
-            self._views.with_image(),
-            is_aligned,
-            is_recheck=node_id % _RECHECK_INTERVAL == 0,
+            self._atlas.graph, node_id, known, self._views.with_image(), is_aligned, is_recheck
         )
         if self._queries.is_hurried:
             by_looks = larger_maps_first(self._atlas.graph, by_looks)
@@ -119,21 +116,27 @@ class KeyframeLookup:
         yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
         search = CandidateSearch([*by_map, *by_looks])
         while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
-            if {node_id, candidate} <= views.keys():  # else removed meanwhile
+            if not {node_id, candidate} <= views.keys():
+                continue  # removed meanwhile
+            is_same_map = self._atlas.graph.is_same_map(node_id, candidate)
+            if not is_same_map or is_recheck or not self._is_gated(node_id, candidate):
                 make_step = self._align_step if candidate in by_map else self._verify_step
-                if (step := make_step(node_id, candidate)) is not None:
-                    yield from self._check(step, search)
+                yield from self._check(make_step(node_id, candidate), search)
 
-    def _align_step(self, node_id: int, candidate: int) -> AlignStep | None:
-        """Step that aligns two keyframes of a map; None where the merge gate leaves it out."""
-        T_c_q = self._atlas.graph.relative_pose(candidate, node_id)
+    def _is_gated(self, node_id: int, candidate: int) -> bool:
+        """Return whether the merge gate leaves out this keyframe of the same map, by the map's poses."""
         a, b = self._atlas.key(candidate), self._atlas.key(node_id)
-        if objection := self._merge_gate.skip_reason(self._overlap_volume(a, b, T_c_q), same_map=True):
+        T_a_b = self._atlas.graph.relative_pose(candidate, node_id)
+        objection = self._merge_gate.skip_reason(self._overlap_volume(a, b, T_a_b), same_map=True)
+        if objection:
             merges = self._counters.runs[b.agent].merges
             merges["requested"] += 1
             merges["skipped"] += 1
             self._log.events.append(MapEvent(b.agent, "merge skipped", f"loop {a} - {b}: {objection}"))
-            return None
+        return bool(objection)
+
+    def _align_step(self, node_id: int, candidate: int) -> AlignStep:
+        T_c_q = self._atlas.graph.relative_pose(candidate, node_id)
         images = self._views.image(node_id), self._views.image(candidate)
         assert images[0] is not None and images[1] is not None
         return AlignStep(node_id, images[0], candidate, images[1], T_c_q)

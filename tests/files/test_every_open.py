@@ -47,6 +47,7 @@ MEMORY = "into memory, or from bytes that are bounded"
 ALLOWED = {
     ("files/locks.py", "open"): "a folder, for its lock",
     ("cli/edge.py", "open"): "MapStore.open",
+    ("cli/dataset_forget.py", "open"): "MapStore.open",
     ("lab/emulate/session.py", "save"): MEMORY,
     ("lab/emulate/world/room_files.py", "load"): "mapped, after open_regular; rebuilt if not whole",
     ("lab/emulate/world/room_files.py", "save"): OURS,
