@@ -22,7 +22,7 @@ from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, SavePoses, StoredMap
 from share.mapping.mapper_log import MapperLog
 from share.mapping.query_queue import QueryQueue, map_rank, restored_ranks, service_kind
-from share.mapping.recognition.keyframe_views import KeyframeArchive, KeyframeViews
+from share.mapping.recognition.keyframe_views import ArchiveReader, KeyframeViews
 from share.mapping.steps import Job, LookupStep, SolveStep, Step, StepRunner
 from share.types import Keyframe
 from share.wire.messages import Hello
@@ -31,7 +31,7 @@ from share.wire.messages import Hello
 class Mapper:
     """The maps of all agents. `agent` always names one run of an agent."""
 
-    def __init__(self, config: Config, archive: KeyframeArchive | None = None) -> None:
+    def __init__(self, config: Config, archive: ArchiveReader | None = None) -> None:
         """archive: images and views of the keyframes, where a map file keeps them."""
         self._config = config
         self._hellos: dict[str, Hello] = {}

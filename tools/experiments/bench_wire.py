@@ -68,8 +68,8 @@ def keys(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
 
 def echo(edge: EdgeLink, stop: threading.Event) -> None:
     while not stop.is_set():
-        if heard := edge.receive(100):
-            edge.send(heard.peer, heard.frames)
+        if received := edge.receive(100):
+            edge.send(received.peer, received.frames)
 
 
 def round_trip(agent: AgentLink, frames: list[Bytes]) -> None:

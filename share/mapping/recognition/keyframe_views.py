@@ -24,7 +24,7 @@ _RESTORED_PER_SLICE = 16
 _NO_VIEW = View.empty()  # one for all, since it takes 500 bytes
 
 
-class KeyframeArchive(Protocol):
+class ArchiveReader(Protocol):
     """Images and views in the map file, as far as they are there already: None, False where not."""
 
     def jpeg(self, key: KeyframeKey) -> U8 | None: ...
@@ -66,7 +66,7 @@ class KeyframeViews:
     archive: what is in it is forgotten here once it was not used for long.
     """
 
-    def __init__(self, archive: KeyframeArchive | None = None) -> None:
+    def __init__(self, archive: ArchiveReader | None = None) -> None:
         self.index = PlaceIndex()
         self._archive = archive
         self._known: dict[int, _Known] = {}
