@@ -160,6 +160,11 @@ def position_sigma(cov: F64) -> float:
     return float(np.sqrt(np.maximum(cov[3:, 3:].trace(), 0.0)))
 
 
+def rotation_sigma(cov: F64) -> float:
+    """Return the rotation sigma, rad: as `position_sigma`, of the rotation block."""
+    return float(np.sqrt(np.maximum(cov[:3, :3].trace(), 0.0)))
+
+
 def transform(T: F64, points: F64) -> F64:
     """Points (..., 3) in frame b -> frame a by T_a_b (4, 4)."""
     return points @ T[:3, :3].T + T[:3, 3]

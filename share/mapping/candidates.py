@@ -16,7 +16,6 @@ import numpy as np
 
 from share.geometry import se3
 from share.mapping.map_graph import MapGraph
-from share.types import F64
 
 # Views further apart than either seldom share enough points.
 _FAR_M = 4.0
@@ -65,17 +64,13 @@ def _by_map_poses(graph: MapGraph, node_id: int, own: Sequence[int]) -> tuple[se
     if not own:
         return out_of_view, alignable
     for other, pose in zip(own, graph.relative_estimates(node_id, own), strict=True):
-        sigma_m, sigma_rad = se3.position_sigma(pose.cov), _rotation_sigma(pose.cov)
+        sigma_m, sigma_rad = se3.position_sigma(pose.cov), se3.rotation_sigma(pose.cov)
         distance_m, angle_rad = float(np.linalg.norm(pose.T[:3, 3])), float(se3.rotation_angle(pose.T))
         if distance_m - _SURE_SIGMAS * sigma_m > _FAR_M or angle_rad - _SURE_SIGMAS * sigma_rad > _FAR_RAD:
             out_of_view.add(other)
         elif sigma_m <= _ALIGN_SIGMA_M and sigma_rad <= _ALIGN_SIGMA_RAD:
             alignable.add(other)
     return out_of_view, alignable
-
-
-def _rotation_sigma(cov: F64) -> float:
-    return float(np.sqrt(np.trace(cov[:3, :3])))
 
 
 def larger_maps_first(graph: MapGraph, others: Sequence[int]) -> list[int]:

@@ -1,8 +1,8 @@
 """A keyframe's way through the map: the jobs that find its loops.
 
 Align its image with those near it in its map -> describe it -> query -> review recent merges -> align or
-verify each candidate -> agreement of the agents -> loop acceptance. The merge gate is before an alignment.
-Jobs yield their slow steps, which the caller runs (`share.mapping.steps`).
+verify each candidate -> agreement of the agents -> loop acceptance. Within a map the merge gate
+stands before these checks. Jobs yield their slow steps, which the caller runs (`share.mapping.steps`).
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ _AHEAD_M = 3.0  # what a wearer looks at
 
 def sigma_ahead(cov: F64) -> float:
     """Return the standard deviation (m) of what is 3 m from a body whose pose has the covariance (6, 6)."""
-    return float(np.hypot(se3.position_sigma(cov), _AHEAD_M * np.sqrt(np.trace(cov[:3, :3]))))
+    return float(np.hypot(se3.position_sigma(cov), _AHEAD_M * se3.rotation_sigma(cov)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,8 @@ from share.mapping.loop_consistency import PLACE_M, PLACE_RAD
 from share.types import F64, I64
 
 T = TypeVar("T")
-InSlices = Generator[
-    int, None, T
-]  # work in slices, each with its cost in some 10 us, with a result at the end
+# Work in slices, each with its cost in some 10 us, with a result at the end.
+InSlices = Generator[int, None, T]
 
 _ROWS_PER_SLICE = 128  # poses whose neighbours are searched for
 _REMOVED_PER_SLICE = 32

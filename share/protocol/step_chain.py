@@ -56,7 +56,8 @@ class StepChain:
         variance = self._variance_since(rows, claimed)
         chi2 = angle_rad**2 / variance[:, 0] + distance_m**2 / variance[:, 1]
         is_false = (rows >= 0) & ~(chi2 <= _MAX_CHI2)
-        agreed = self._bounded(_kept(earlier, (rows >= 0) & ~is_false))
+        is_agreed = (rows >= 0) & ~is_false
+        agreed = self._bounded(_kept(earlier, is_agreed), rows[is_agreed])
         if not is_false.any():
             return agreed, None
         worst = int(np.where(is_false, distance_m, -1.0).argmax())
@@ -74,9 +75,8 @@ class StepChain:
         variance[:, 1] += length_m**2 * variance[:, 0] / 3  # by the rotations on the way
         return np.asarray(variance)
 
-    def _bounded(self, earlier: EarlierPoses) -> EarlierPoses:
-        """Return poses relative to keyframes of the chain with the least variance that the steps allow."""
-        rows = np.array([self._row(one) for one in earlier.ids.tolist()], np.int64)
+    def _bounded(self, earlier: EarlierPoses, rows: I64) -> EarlierPoses:
+        """Return poses relative to keyframes in these rows, with the least variance that the steps allow."""
         count = len(self.ids) - 1 - rows
         least = _LEAST_SHARE * (self.variance[-1] - self.variance[rows]) / count[:, None]
         missing = np.maximum(0.0, least - _variance(earlier.cov))

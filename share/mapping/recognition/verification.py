@@ -290,7 +290,7 @@ def _check_spread(y: F64, side: str) -> None:
 
 def _check_uncertainty(cov: F64) -> None:
     """Refuse an uncertain pose; most wrong poses that pass the other checks fail here."""
-    degrees = float(np.degrees(np.sqrt(np.trace(cov[:3, :3]))))
+    degrees = float(np.degrees(se3.rotation_sigma(cov)))
     if degrees > MAX_SIGMA_DEG:
         raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {MAX_SIGMA_DEG:.2f}° allowed")
 
