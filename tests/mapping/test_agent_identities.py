@@ -382,6 +382,7 @@ def pair_with_withdrawn_loops(decide=None) -> tuple[Atlas, list[Loop]]:
             atlas.add_keyframe(walker.name, keyframe)
     loops = near_loops(ann, bob, np.random.default_rng(0))
     atlas.quarantine.withdrawn = list(loops)
+    atlas.quarantine.schedule_withdrawn()
     if decide is not None:
         atlas.loop_acceptance.decide = decide
     return atlas, loops
@@ -392,13 +393,17 @@ def test_withdrawn_loops_wait_while_their_agents_are_kept_apart():
     atlas, loops = pair_with_withdrawn_loops()
     quarantine, unverified = atlas.quarantine, atlas.quarantine.agreement.identities.unverified
     unverified.add("bob")
-    assert quarantine.reconsider_withdrawn() == ((), ())
+    change = quarantine.reconsider_withdrawn()
+    assert not change.added
+    assert not change.dropped
     unverified.clear()
     gone = Loop(KeyframeKey("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
     quarantine.withdrawn.append(gone)
-    tied, undone = quarantine.reconsider_withdrawn()
-    assert len(tied) > len(loops) / 2
-    assert not undone
+    quarantine.schedule_withdrawn()
+    changes = [quarantine.reconsider_withdrawn() for _ in loops]
+    assert sum(len(change.added) for change in changes) > len(loops) / 2
+    assert len(changes[0].added) < len(loops) / 2  # a few at a time
+    assert not any(change.dropped for change in changes)
     assert not quarantine.withdrawn
 
 
@@ -416,9 +421,10 @@ def test_a_loop_added_again_and_undone_at_once_is_not_reported_as_added():
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
 
     atlas, loops = pair_with_withdrawn_loops(decide)
-    tied, undone = atlas.quarantine.reconsider_withdrawn()
-    assert tied == tuple(loops[1:])
-    assert undone == (loops[0],)
+    change = atlas.quarantine.reconsider_withdrawn()
+    assert change.added
+    assert loops[0] not in change.added
+    assert change.dropped == (loops[0],)
 
 
 def test_scales_are_applied_in_the_order_of_names():

@@ -53,11 +53,13 @@ class Raised:
 
 
 class InnerEdge:
-    """raised: all exceptions; cpu_ms: the longest of each kind of call, and during which message."""
+    """raised: all exceptions; cpu_ms: the longest of each kind of call, and during which message. keys: of the
+    names that have one."""
 
     def __init__(self, max_keyframes: int = 300) -> None:
         config = Config(edge=EdgeConfig(max_keyframes=max_keyframes))
         self.edge, self.mapper, self.solver = Edge(config, 7), Mapper(config), PoseGraphSolver()
+        self.keys: dict[str, str] = {}
         self.raised: list[Raised] = []
         self.cpu_ms: dict[str, tuple[float, int]] = defaultdict(lambda: (0.0, -1))
         self.events: defaultdict[str, int] = defaultdict(int)
@@ -82,7 +84,7 @@ class InnerEdge:
             if step is not None:
                 self._finish(step, step.run)
             solve = self._timed("next solve", self.mapper.next_solve, None)
-            self._found(self.mapper.take_failures())
+            self._found(self.mapper.take_events())
             if solve is not None:
                 self._finish(solve, partial(solve.run, self.solver))
             if step is None and solve is None:
@@ -118,7 +120,7 @@ class InnerEdge:
                     if code == MESSAGE_CODES[Ack]:
                         self.acked[peer] = scalars[0]
                 case ed.AddRun(key, hello):
-                    mapper.add_run(key, hello)
+                    mapper.add_run(key, hello, self.keys.get(hello.name, ""))
                 case ed.SetPresence(key, is_present):
                     mapper.set_present(key, is_present)
                 case ed.DropRun(key):

@@ -35,7 +35,7 @@ LEAP = 70  # ids: a run that leapt so far is given up
 
 
 class KeyframeFuzz:
-    """honest: two agents that walk; the attacker walks with them under ever new runs."""
+    """honest: two agents that walk; the attacker walks with them under ever new runs, by names of one key."""
 
     def __init__(self, seed: int) -> None:
         self.edge, self._draw = InnerEdge(), random.Random(seed)
@@ -109,6 +109,7 @@ class KeyframeFuzz:
         self._runs += 1
         start = self._draw.randrange(PLACES)
         agent = PictureAgent(f"eve{self._runs % 20}", 1000 + self._runs, start)
+        self.edge.keys[agent.hello.name] = "eve's"
         self.edge.hear(agent.peer, said(agent.hello))
         return agent
 

@@ -24,6 +24,7 @@ from share.types import F64
 
 _MIN_LOOP_SUPPORT = 12  # loops between two segments; fewer may fit only because a map was bent
 _MAX_WITHDRAWN = 2000  # newest withdrawn loops
+_RECONSIDERED_AT_ONCE = 8  # withdrawn loops: 13 ms each where they may join maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +37,13 @@ class QuarantineChange:
 
 
 class Quarantine:
-    """Quarantine in one graph. withdrawn: loops that are kept for later."""
+    """Quarantine in one graph. withdrawn: loops that are kept until the agents' standings change."""
 
     def __init__(self, graph: MapGraph, loop_acceptance: LoopAcceptance) -> None:
         self.agreement = AgentAgreement()
         self._graph, self._loop_acceptance = graph, loop_acceptance
         self.withdrawn: list[Loop] = []
+        self._to_reconsider: list[Loop] = []
 
     def remove_run(self, run: str) -> None:
         """Forget a run without keyframes that will not return."""
@@ -57,13 +59,14 @@ class Quarantine:
             self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
-        """Compare the agents of a verified loop, and split maps of agents that no longer agree.
+        """Compare the agents of a verified loop, and split maps of agents that no longer agree. Decide again
+        on a few withdrawn loops, if scheduled.
 
         depth_scale: of b's depths relative to a's.
         """
         agents = loop.a.agent, loop.b.agent
         if agents[0] == agents[1]:
-            return QuarantineChange()
+            return self.reconsider_withdrawn()
         a, b = self._graph.loop_nodes(loop)
         edge = PoseEdge(a, b, loop.T_a_b, loop.cov)
         segments = self._graph.segment(loop.a), self._graph.segment(loop.b)
@@ -72,15 +75,16 @@ class Quarantine:
         changed = self.agreement.add_loop(agents, segments, edge, depth_scale, self._tilt(edge))
         self.apply_scales()
         if not changed and len(unverified) == unverified_before:
-            return QuarantineChange()
+            return self.reconsider_withdrawn()
         after = self._separated()
         affected = map(
             self.agreement.identities.newest_run, (before[0] ^ after[0]).union(*(before[1] ^ after[1]))
         )
         standings = {name: self.agreement.standing(name) for name in sorted(affected)}
         dropped = self._split_maps()
-        added, undone = self.reconsider_withdrawn()
-        return QuarantineChange(standings, (*dropped, *undone), added)
+        self.schedule_withdrawn()
+        reconsidered = self.reconsider_withdrawn()
+        return QuarantineChange(standings, (*dropped, *reconsidered.dropped), reconsidered.added)
 
     def _separated(self) -> tuple[frozenset[str], frozenset[frozenset[str]]]:
         return self.agreement.quarantined, self.agreement.disputed
@@ -184,22 +188,28 @@ class Quarantine:
                 out.append(edge_id)
         return out
 
-    def reconsider_withdrawn(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
-        """Decide again on withdrawn loops that are no longer forbidden; return those added and those dropped.
+    def schedule_withdrawn(self) -> None:
+        """Have all withdrawn loops decided again, a few at a time, since standings have changed."""
+        self._to_reconsider = [*self._to_reconsider, *self.withdrawn][-_MAX_WITHDRAWN:]
+        self.withdrawn = []
 
-        Others stay withdrawn while their keyframes exist.
+    def reconsider_withdrawn(self) -> QuarantineChange:
+        """Decide again on the next few scheduled loops.
+
+        Those still forbidden are withdrawn again, while their keyframes exist.
         """
-        odometry, decisions, still_withdrawn = self._graph.odometry, list[LoopDecision](), list[Loop]()
-        for loop in self.withdrawn:
+        odometry, decisions = self._graph.odometry, list[LoopDecision]()
+        while self._to_reconsider and len(decisions) < _RECONSIDERED_AT_ONCE:
+            loop = self._to_reconsider.pop(0)
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
                 continue
             if self.agreement.are_separated(loop.a.agent, loop.b.agent) or self.separation_reason(loop):
-                still_withdrawn.append(loop)
+                self.withdrawn.append(loop)
             else:
                 decisions.append(self._loop_acceptance.decide(loop))
-        self.withdrawn = still_withdrawn
-        undone = tuple(x for d in decisions for x in d.dropped)
-        return tuple(x for d in decisions for x in d.added if x not in undone), undone
+        dropped = tuple(x for d in decisions for x in d.dropped)
+        added = tuple(x for d in decisions for x in d.added if x not in dropped)
+        return QuarantineChange(dropped=dropped, added=added)
 
     def _agents_in_map(self, reference_segment: int) -> set[str]:
         return {self._graph.odometry.segments[s].agent for s in self._graph.map_segments(reference_segment)}
