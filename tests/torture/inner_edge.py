@@ -53,8 +53,9 @@ class Raised:
 
 
 class InnerEdge:
-    """raised: all exceptions; cpu_ms: the longest of each kind of call, and during which message. keys: of the
-    names that have one."""
+    """raised: all exceptions; cpu_ms: the longest of each kind of call, and during which message.
+
+    keys: of the names that have one."""
 
     def __init__(self, max_keyframes: int = 300) -> None:
         config = Config(edge=EdgeConfig(max_keyframes=max_keyframes))
