@@ -227,6 +227,17 @@ def test_nothing_that_is_valid_raises(seed: int) -> None:
     assert all(np.linalg.eigvalsh(cov)[0] > 0 for cov in solution.covariances)
 
 
+def test_a_pose_behind_an_edge_too_vague_to_count_is_at_an_unknown_place() -> None:
+    """The information of the sure edge rounds that of the vague one away: the matrix is exactly singular."""
+    T, eye = np.tile(np.eye(4), (3, 1, 1)), np.eye(6)
+    chain = [PoseEdge(0, 1, np.eye(4), 1e12 * eye), PoseEdge(1, 2, np.eye(4), 1e-12 * eye)]
+    solver = PoseGraphSolver()
+    solver.update(change(dict(enumerate(T)), chain, []))
+    solution = solver.solve(0, [1, 2])
+    assert not solution.reason
+    assert (solution.covariances.diagonal(axis1=1, axis2=2) >= 1e6).all()
+
+
 def test_poses_without_a_finite_cost_are_returned_unchanged() -> None:
     far = np.eye(4)
     far[0, 3] = 1e200

@@ -235,13 +235,15 @@ def _tightest_edges(n: int, edges: EdgeArrays, cost: F64, anchor: int, wanted: I
 
 
 def _inverse_diagonal_blocks(information: Any, wanted: I64) -> F64:
-    """Diagonal blocks (K, 6, 6) of the inverse at `wanted`."""
+    """Diagonal blocks (K, 6, 6) of the inverse at `wanted`; unknown where it is singular by rounding."""
     from scipy.sparse.linalg import splu
 
-    symmetric = {"SymmetricMode": True}
-    factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    symmetric, k = {"SymmetricMode": True}, len(wanted)
+    try:
+        factor = splu(information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    except RuntimeError:  # edges 1e12 times as vague as others
+        return np.repeat(_UNKNOWN_COV[None], k, axis=0)
     rows = 6 * wanted[:, None] + np.arange(6)
-    k = len(wanted)
     right = np.zeros((information.shape[0], 6 * k))
     right[rows.ravel(), np.arange(6 * k)] = 1
     blocks = factor.solve(right)[rows.ravel()].reshape(k, 6, k, 6)
