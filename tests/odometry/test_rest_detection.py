@@ -1,11 +1,13 @@
-"""A body at rest: detection by the IMU, and the zero-velocity update."""
+"""A body at rest: detection by IMU and images, and the zero-velocity update."""
 
 import numpy as np
+import pytest
 from helpers.imu_world import NOISE, Path, imu_of
 
 from share.config import InertialConfig
 from share.odometry import filter
 from share.odometry.imu_predictor import ImuBuffer, ImuPredictor, fill_clipped
+from share.odometry.rest_detection import RestDetector
 from share.odometry.state import CORE_SIZE, VELOCITY, initial_state
 from share.types import ImuBatch
 
@@ -42,16 +44,65 @@ def test_noise_alone_is_rest_and_motion_is_not():
     assert not buffered(imu_of(Path(1, size=0.0, turn=0.1), t, 0.01, 0.2, rng)[0]).is_still(10**9)
 
 
-def test_rest_is_believed_once_the_velocity_is_known():
-    """An IMU that moves smoothly measures the same as one at rest."""
+def views(frames, hz=15, speed_px_s=0.0, count=40, noise_px=0.05, movers=0, first_id=lambda k: 0):
+    """Return what a detector says of each of some frames that move by `speed_px_s`, `movers` of their
+    features at 100 px/s. first_id: of the features in frame k."""
+    rng, detector = np.random.default_rng(7), RestDetector()
+    where, said = rng.uniform(0, 600, (count, 2)), []
+    for k in range(frames):
+        s = state([0.0, 0.0, 0.0], 0.1)
+        s.stamp_ns, s.feature_ids = k * 10**9 // hz, first_id(k) + np.arange(count)
+        px = where + [speed_px_s * k / hz, 0.0] + rng.normal(0, noise_px, where.shape)
+        px[:movers, 1] += 100.0 * k / hz
+        said.append(detector.is_at_rest(s, px.astype(np.float32), np.ones(count, bool), imu_is_still=True))
+    return said
+
+
+def test_an_imu_at_constant_velocity_measures_what_one_at_rest_does():
     t, rng = np.arange(0, 1, 1 / NOISE.rate_hz), np.random.default_rng(4)
     predictor, still = ImuPredictor(NOISE, InertialConfig()), Path(1, size=0.0, turn=0.0)
     predictor.buffer.add(imu_of(still, t, rng=rng)[0])
-    for velocity, sigma, is_updated in ((0.0, 0.1, False), (0.08, 0.02, False), (0.01, 0.02, True)):
-        s = state([velocity, 0.0, 0.0], sigma)
-        s.T, s.stamp_ns = still.poses(0.0), 900_000_000
-        predictor.predict(s, 950_000_000, gyro_only=False)
-        assert (np.sqrt(s.cov[6, 6]) < 0.8 * sigma) == is_updated
+    s = state([0.3, 0.0, 0.0], 0.01)
+    s.T, s.stamp_ns = still.poses(0.0), 900_000_000
+    assert predictor.predict(s, 950_000_000, gyro_only=False).is_still
+    assert s.v[0] == pytest.approx(0.3, abs=0.02)
+
+
+def test_images_that_stay_show_rest_after_a_quarter_of_a_second():
+    assert views(8) == [False] * 4 + [True] * 4
+    assert views(12, hz=30) == [False] * 8 + [True] * 4
+    assert views(4, hz=2) == [False] + [True] * 3
+
+
+@pytest.mark.parametrize(("hz", "speed_px_s"), [(15, 7.5), (30, 7.5), (30, 2.0), (60, 7.5)])
+def test_a_slow_motion_shows_over_several_frames(hz, speed_px_s):
+    """0.1 m/s at 5 m is 7.5 px/s: 0.25 px a frame at 30 Hz."""
+    assert not any(views(2 * hz, hz, speed_px_s))
+
+
+def test_what_moves_by_itself_does_not_hide_rest():
+    assert views(8, movers=15)[-1]
+    assert not views(8, movers=25)[-1]
+
+
+def test_other_features_say_nothing():
+    assert not any(views(8, first_id=lambda k: 100 * k))
+
+
+def test_rest_needs_an_imu_that_is_still():
+    detector, px, is_static = RestDetector(), np.zeros((40, 2), np.float32), np.ones(40, bool)
+    for k in range(8):
+        s = state([0.0, 0.0, 0.0], 0.01)
+        s.stamp_ns, s.feature_ids = k * 10**8, np.arange(40)
+        assert not detector.is_at_rest(s, px, is_static, imu_is_still=False)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "sigma", "is_rest"), [(0.0, 0.1, False), (0.08, 0.02, False), (0.01, 0.02, True)]
+)
+def test_in_the_dark_rest_is_believed_once_the_velocity_is_known(velocity, sigma, is_rest):
+    s, none = state([velocity, 0.0, 0.0], sigma), np.zeros((0, 2), np.float32)
+    assert RestDetector().is_at_rest(s, none, np.zeros(0, bool), imu_is_still=True) == is_rest
 
 
 def test_no_recent_samples_is_not_rest():
