@@ -256,7 +256,7 @@ class InertialTracker:
         imu = self._predict(frame, s)
         matches = landmarks.match_features(frame, last_frame.image0, interval_ns * 1e-9)
         visual_update.mark_dynamic(landmarks, matches, self._rig.cam0, self._imu.rate)
-        if self._rest.is_at_rest(s, matches.px, matches.is_found & ~matches.is_dynamic, imu.is_still):
+        if self._rest.is_at_rest(s, matches.at, matches.is_found & ~matches.is_dynamic, imu.is_still):
             filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA)
         inliers, nis = self._update(landmarks, matches, interval_ns)
         count = int(inliers.sum())

@@ -5,6 +5,8 @@ import pytest
 from helpers.imu_world import NOISE, Path, imu_of
 
 from share.config import InertialConfig
+from share.geometry import se3
+from share.geometry.camera import project
 from share.odometry import filter
 from share.odometry.imu_predictor import ImuBuffer, ImuPredictor, fill_clipped
 from share.odometry.rest_detection import RestDetector
@@ -44,18 +46,28 @@ def test_noise_alone_is_rest_and_motion_is_not():
     assert not buffered(imu_of(Path(1, size=0.0, turn=0.1), t, 0.01, 0.2, rng)[0]).is_still(10**9)
 
 
-def views(frames, hz=15, speed_px_s=0.0, count=40, noise_px=0.05, movers=0, first_id=lambda k: 0):
-    """Return what a detector says of each of some frames that move by `speed_px_s`, `movers` of their
-    features at 100 px/s. first_id: of the features in frame k."""
-    rng, detector = np.random.default_rng(7), RestDetector()
-    where, said = rng.uniform(0, 600, (count, 2)), []
+FOCAL = 385.0
+
+
+def answers(frames, hz=15, velocity=(0.0, 0.0, 0.0), rate=0.0, movers=0, first_id=lambda k: 0, still=True):
+    """Return what a detector says of each frame of a camera with 40 features 1.5 to 8 m away.
+
+    velocity: m/s, of the camera, x aside and z ahead. rate: rad/s. movers: features that move at 0.3 m/s.
+    first_id: of the features in frame k. still: by the IMU.
+    """
+    rng, detector, out = np.random.default_rng(7), RestDetector(), []
+    ray, depth = rng.uniform(-0.6, 0.6, (40, 2)), rng.uniform(1.5, 8.0, 40)
+    points = np.column_stack([ray, np.ones(40)]) * depth[:, None]
     for k in range(frames):
         s = state([0.0, 0.0, 0.0], 0.1)
-        s.stamp_ns, s.feature_ids = k * 10**9 // hz, first_id(k) + np.arange(count)
-        px = where + [speed_px_s * k / hz, 0.0] + rng.normal(0, noise_px, where.shape)
-        px[:movers, 1] += 100.0 * k / hz
-        said.append(detector.is_at_rest(s, px.astype(np.float32), np.ones(count, bool), imu_is_still=True))
-    return said
+        s.T = se3.from_rt(se3.so3_exp(np.array([0.0, rate * k / hz, 0.0])), np.array(velocity) * k / hz)
+        s.stamp_ns, s.feature_ids = k * 10**9 // hz, first_id(k) + np.arange(40)
+        s.keyframe_ids, s.keyframe_poses, s.anchor = np.zeros(1, np.int64), np.eye(4)[None], np.zeros(40, int)
+        s.ray, s.rho = ray, 1 / depth
+        seen = points + (np.arange(40) < movers)[:, None] * [0.0, 0.3 * k / hz, 0.0]
+        uv = project(se3.transform(se3.inverse(s.T), seen))[0] + rng.normal(0, 0.1 / FOCAL, (40, 2))
+        out.append(detector.is_at_rest(s, uv, np.ones(40, bool), still))
+    return out
 
 
 def test_an_imu_at_constant_velocity_measures_what_one_at_rest_does():
@@ -68,40 +80,41 @@ def test_an_imu_at_constant_velocity_measures_what_one_at_rest_does():
     assert s.v[0] == pytest.approx(0.3, abs=0.02)
 
 
-def test_images_that_stay_show_rest_after_a_quarter_of_a_second():
-    assert views(8) == [False] * 4 + [True] * 4
-    assert views(12, hz=30) == [False] * 8 + [True] * 4
-    assert views(4, hz=2) == [False] + [True] * 3
+def test_images_show_rest_after_a_quarter_of_a_second():
+    assert answers(8) == [False] * 4 + [True] * 4
+    assert answers(12, hz=30) == [False] * 8 + [True] * 4
+    assert answers(4, hz=2) == [False] + [True] * 3
 
 
-@pytest.mark.parametrize(("hz", "speed_px_s"), [(15, 7.5), (30, 7.5), (30, 2.0), (60, 7.5)])
-def test_a_slow_motion_shows_over_several_frames(hz, speed_px_s):
-    """0.1 m/s at 5 m is 7.5 px/s: 0.25 px a frame at 30 Hz."""
-    assert not any(views(2 * hz, hz, speed_px_s))
+def test_the_sway_of_a_standing_person_is_rest():
+    """Not the turning counts, 2 px in the time, but the displacement."""
+    assert answers(8, velocity=(0.005, 0.0, 0.003), rate=0.02)[-1]
+
+
+@pytest.mark.parametrize("hz", [5, 15, 30, 60])
+@pytest.mark.parametrize("velocity", [(0.1, 0.0, 0.0), (0.0, 0.0, 0.1), (0.0, 0.0, 0.04), (0.03, 0.0, 0.0)])
+def test_a_smooth_motion_shows_over_several_frames(hz, velocity):
+    """0.1 m/s at 5 m is 7.7 px/s: 0.13 px a frame at 60 Hz."""
+    assert not any(answers(2 * hz, hz, velocity))
 
 
 def test_what_moves_by_itself_does_not_hide_rest():
-    assert views(8, movers=15)[-1]
-    assert not views(8, movers=25)[-1]
+    assert answers(8, movers=12)[-1]
 
 
 def test_other_features_say_nothing():
-    assert not any(views(8, first_id=lambda k: 100 * k))
+    assert not any(answers(8, first_id=lambda k: 100 * k))
 
 
 def test_rest_needs_an_imu_that_is_still():
-    detector, px, is_static = RestDetector(), np.zeros((40, 2), np.float32), np.ones(40, bool)
-    for k in range(8):
-        s = state([0.0, 0.0, 0.0], 0.01)
-        s.stamp_ns, s.feature_ids = k * 10**8, np.arange(40)
-        assert not detector.is_at_rest(s, px, is_static, imu_is_still=False)
+    assert not any(answers(8, still=False))
 
 
 @pytest.mark.parametrize(
     ("velocity", "sigma", "is_rest"), [(0.0, 0.1, False), (0.08, 0.02, False), (0.01, 0.02, True)]
 )
 def test_in_the_dark_rest_is_believed_once_the_velocity_is_known(velocity, sigma, is_rest):
-    s, none = state([velocity, 0.0, 0.0], sigma), np.zeros((0, 2), np.float32)
+    s, none = state([velocity, 0.0, 0.0], sigma), np.zeros((0, 2))
     assert RestDetector().is_at_rest(s, none, np.zeros(0, bool), imu_is_still=True) == is_rest
 
 
