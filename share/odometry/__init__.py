@@ -4,6 +4,7 @@ Begin with `inertial_tracker.InertialTracker.track`. A frame's way, in the order
 
     imu_predictor        propagate the state to the image (`imu_propagation`, `imu_outliers`)
     feature_matching     predict the features' positions and align their patches (`feature_appearance`)
+    rest_detection       a zero-velocity update where IMU and images show none of a motion
     visual_update        reject what moves in the room, linearise, gate, update
     health               the state of the result: OK, WEAK, LOST
     keyframes            work after the pose, in slices: surfaces to publish, new features (`landmarks`)

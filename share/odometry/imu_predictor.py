@@ -15,7 +15,7 @@ from share.geometry.camera import ImuNoise
 from share.odometry import filter
 from share.odometry.imu_outliers import ImuInflation, ImuOutlierDetector
 from share.odometry.imu_propagation import integrate, noise_with_vibration, noise_without_axes, scaled_noise
-from share.odometry.state import VELOCITY, FilterState
+from share.odometry.state import FilterState
 from share.types import F64, ImuBatch
 
 _MAX_SAMPLES = 600
@@ -150,10 +150,6 @@ def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
 
 
 _MAX_REST_RATE = 0.03  # rad/s
-# A smooth ride looks like rest to an IMU, but not to the images: the filter's velocity has to be near zero,
-# and known so well before rest is believed.
-_MAX_REST_M_S, _MAX_REST_SIGMA_M_S = 0.04, 0.03
-_ZERO_VELOCITY_SIGMA = 0.02  # m/s
 _SILENT_NS = 100_000_000  # the IMU counts as silent after this long without a sample; then
 _TURNING_NOISE = 0.5  # rad/s/sqrt(Hz) is the process noise of the angular rate,
 _MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz) that of the velocity
@@ -161,11 +157,13 @@ _MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz) that of the velocity
 
 class ImuUse(NamedTuple):
     """The basis of a prediction: has_gyro, the gyro measured all axes; has_samples, the IMU was not
-    silent; has_rejected, some of its samples were rejected."""
+    silent; has_rejected, some of its samples were rejected; is_still, it measured what it does at rest and at
+    constant velocity."""
 
     has_gyro: bool
     has_samples: bool
     has_rejected: bool
+    is_still: bool = False
 
 
 class ImuPredictor:
@@ -215,15 +213,11 @@ class ImuPredictor:
         self.rate = filter.propagate(s, samples, to_ns, noise, gravity)
         if inflation is not None:
             filter.inflate(s, inflation.turn_rad, 0.0, inflation.speed_m_s)
-        elif self._is_at_rest(s, to_ns):
-            filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA)
-        return ImuUse(not silent_axes[:3].any(), True, has_rejected)
+        is_still = inflation is None and self._is_still(to_ns)
+        return ImuUse(not silent_axes[:3].any(), True, has_rejected, is_still)
 
-    def _is_at_rest(self, s: FilterState, now_ns: int) -> bool:
-        if np.linalg.norm(self.rate) >= _MAX_REST_RATE or np.linalg.norm(s.v) >= _MAX_REST_M_S:
-            return False
-        is_known = s.cov.diagonal()[VELOCITY].max() < _MAX_REST_SIGMA_M_S**2
-        return bool(is_known) and self.buffer.is_still(now_ns)
+    def _is_still(self, now_ns: int) -> bool:
+        return bool(np.linalg.norm(self.rate) < _MAX_REST_RATE) and self.buffer.is_still(now_ns)
 
     def pose_at(self, s: FilterState, t_ns: int, imu: ImuBatch) -> F64:
         """Return T_odom_body (4, 4) at a time after the state's, with samples that came since.

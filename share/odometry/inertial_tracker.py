@@ -31,6 +31,7 @@ from share.odometry.keyframes import KeyframeScheduler
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
 from share.odometry.relocalisation import LocalMap
+from share.odometry.rest_detection import RestDetector
 from share.odometry.state import FilterState, twist
 from share.odometry.tilt_realignment import TiltRealignment
 from share.odometry.track_result import TrackResult, finite_median
@@ -50,6 +51,7 @@ from share.vision.orb import measures_depth
 _LONG_GAP_NS = 250_000_000  # between frames; integration over more is worse than the IMU's noise model says
 _MAX_IMU_WAIT_FRAMES = 10  # without an IMU sample, after which the tracker begins without IMU
 _MIN_PROVEN = WEAK // 2  # static features that are proven, without which no first pose is published
+_ZERO_VELOCITY_SIGMA = 0.02  # m/s, at rest
 _MAX_UP_SIGMA_RAD = np.radians(3.0)  # tilt sigma up to which the up direction is published
 
 
@@ -69,6 +71,7 @@ class InertialTracker:
         self._rig, self._config = rig, config
         self._bias = initialisation.unknown_bias(config) if bias is None else bias
         self._imu = ImuPredictor(rig.imu, config)
+        self._rest = RestDetector()
         self._landmarks: LandmarkMap | None = None
         self._mono_window: MonoWindow | None = None  # of a single camera, until the scale is known
         self._last_frame: Frame | None = None
@@ -241,6 +244,7 @@ class InertialTracker:
         self._landmarks, self._has_published, self._lost_ns = landmarks, False, None
         self._start_ns, self._start_position = s.stamp_ns, s.T[:3, 3].copy()  # by the IMU's clock
         self._mono_window = start_mono_window(s, self._rig.cam0, self._imu.noise, self._config)
+        self._rest = RestDetector()
         self._new_segment = new_segment
         if new_segment:
             self._local_map = LocalMap()
@@ -252,6 +256,8 @@ class InertialTracker:
         imu = self._predict(frame, s)
         matches = landmarks.match_features(frame, last_frame.image0, interval_ns * 1e-9)
         visual_update.mark_dynamic(landmarks, matches, self._rig.cam0, self._imu.rate)
+        if self._rest.is_at_rest(s, matches.at, matches.is_found & ~matches.is_dynamic, imu.is_still):
+            filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA)
         inliers, nis = self._update(landmarks, matches, interval_ns)
         count = int(inliers.sum())
         if not imu.has_gyro:
