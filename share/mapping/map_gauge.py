@@ -1,11 +1,11 @@
 """The gauge: where a map as a whole lies in the frame that its agents are shown.
 
-What is measured in a map is relative, so where it lies as a whole is a convention. Fixed by one keyframe, the
-whole map moves whenever the way from there to where the agents are becomes better known: all see it move,
-though nothing changes between them. So the frame that is shown may lie off the one in which the map is solved,
-and follows those who are in it: a solution is put where it moves them least, the surest odometry least of all
-(inner constraints of a free network; Meissl, 1969). But never further off than the agents' positions in the
-map are uncertain: a drift that is known is corrected for all.
+What is measured in a map is relative, so where it lies as a whole is a convention. Were it fixed by one
+keyframe, the whole map would move whenever the way from there to where the agents are becomes better known:
+all would see it move, though nothing changes between them. So the frame that is shown may lie off the one in
+which the map is solved: a solution is put where it moves those in it least, the surest odometry least of all
+(as the inner constraints of a free network do; Meissl, 1969). But no further off than the agents' places are
+uncertain: a drift that is known is corrected, for all alike.
 """
 
 from __future__ import annotations
@@ -37,28 +37,21 @@ class SolvedPlace:
 
 
 class MapGauge:
-    """The gauge of each map, by its reference segment, and what was shown to each segment."""
+    """Remembers where each segment was shown."""
 
     def __init__(self) -> None:
-        self._T_shown_map: dict[int, F64] = {}  # by reference segment
-        self._shown: dict[int, tuple[int, F64]] = {}  # by segment: its map, and T_map_odom as shown
+        self._shown: dict[int, tuple[int, F64]] = {}  # by segment: reference segment, T_map_odom as shown
 
     def forget_all_but(self, segments: Collection[int]) -> None:
         """Forget all but these segments: the others have no keyframes."""
-        self._T_shown_map = {s: T for s, T in self._T_shown_map.items() if s in segments}
         self._shown = {s: shown for s, shown in self._shown.items() if s in segments}
 
     def show(self, reference_segment: int, places: Mapping[int, SolvedPlace]) -> dict[int, F64]:
         """Return T_map_odom (4, 4) to show to each segment of a map, for places as solved."""
-        before = {
-            s: self._shown[s][1]
-            for s in places
-            if s in self._shown and self._shown[s][0] == reference_segment
-        }
-        T_shown_map = self._T_shown_map.get(reference_segment, np.eye(4))
-        if before:
-            T_shown_map = _gauge([places[s] for s in before], list(before.values()))
-            self._T_shown_map[reference_segment] = T_shown_map
+        known = [s for s in places if self._shown.get(s, (None,))[0] == reference_segment]
+        T_shown_map = np.eye(4)
+        if known:
+            T_shown_map = _gauge([places[s] for s in known], [self._shown[s][1] for s in known])
         shown = {s: se3.orthonormal(T_shown_map @ place.T_map_odom) for s, place in places.items()}
         self._shown |= {s: (reference_segment, T) for s, T in shown.items()}
         return shown

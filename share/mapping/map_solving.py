@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from share.geometry import se3
@@ -84,6 +84,10 @@ class MapSolving:
 
     def remove_run(self, agent: str) -> None:
         self._answered_ids.pop(agent, None)
+
+    def forget_all_but(self, segments: Collection[int]) -> None:
+        """Forget what was shown to all but these segments: the others have no keyframes."""
+        self._gauge.forget_all_but(segments)
 
     def schedule_unpublished(self, agent: str) -> None:
         """Solve the map of a run that reconnected, unless its pose there was published."""
