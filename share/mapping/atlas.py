@@ -220,6 +220,7 @@ class Atlas:
         """Forget what else is known of removed keyframes. Return them as the map file keeps them."""
         graph = self.graph
         self._localisation_gate.forget_all_but(graph.odometry.live_segments)
+        self.solving.forget_all_but(graph.odometry.live_segments)
         live = {graph.reference_segments[segment] for segment in graph.odometry.live_segments}
         graph.unsolved_maps = dict.fromkeys(
             reference_segment for reference_segment in graph.unsolved_maps if reference_segment in live

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from share.geometry import se3
@@ -11,11 +11,13 @@ from share.mapping.graph.solver import GraphSolution, GraphUpdate
 from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
 from share.mapping.loop_acceptance import LoopAcceptance, pending_text
 from share.mapping.loops import KeyframeKey, Loop
+from share.mapping.map_gauge import MapGauge, SolvedPlace
 from share.mapping.map_graph import MapGraph
 from share.mapping.segments import AgentRuns
-from share.types import Correction
+from share.types import F64, Correction
 
 _OUTLIER_CHI2 = 1000.0  # loops with a larger chi-squared after a solution are dropped
+_MIN_STEP_VARIANCE = 1e-8  # m^2, below the floor of any step
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +75,7 @@ class MapSolving:
     ) -> None:
         self._graph, self._loop_acceptance = graph, loop_acceptance
         self._localisation_gate, self._runs = localisation_gate, runs
+        self._gauge = MapGauge()
         self._answered_ids: dict[str, int] = {}  # newest keyframe of each agent with a loop not solved yet
 
     def mark_answered(self, key: KeyframeKey) -> None:
@@ -81,6 +84,10 @@ class MapSolving:
 
     def remove_run(self, agent: str) -> None:
         self._answered_ids.pop(agent, None)
+
+    def forget_all_but(self, segments: Collection[int]) -> None:
+        """Forget what was shown to all but these segments: the others have no keyframes."""
+        self._gauge.forget_all_but(segments)
 
     def schedule_unpublished(self, agent: str) -> None:
         """Solve the map of a run that reconnected, unless its pose there was published."""
@@ -207,18 +214,32 @@ class MapSolving:
 
         Keyframes newer than the solution follow the newest solved one rigidly.
         """
-        odometry, answered_ids = self._graph.odometry, dict(job.answered_ids)
+        graph, odometry, answered_ids = self._graph, self._graph.odometry, dict(job.answered_ids)
+        passed: dict[int, tuple[int, F64]] = {}  # by segment: newest solved node, and covariance
+        for segment, last in zip(job.segments, job.newest_nodes, strict=True):
+            cov = self._localisation_gate.published_cov(segment, job.segments[0])
+            is_current = odometry.current_segment(odometry.segments[segment].agent) == segment
+            if cov is not None and is_current and last in odometry.nodes:
+                passed[segment] = last, cov
+        shown = self._gauge.show(
+            job.segments[0], {s: self._solved_place(last, cov) for s, (last, cov) in passed.items()}
+        )
         out: dict[str, Correction] = {}
         failed: dict[str, str] = {}
-        for segment, last in zip(job.segments, job.newest_nodes, strict=True):
-            agent = odometry.segments[segment].agent
-            cov = self._localisation_gate.published_cov(segment, job.segments[0])
-            if cov is None or odometry.current_segment(agent) != segment or last not in odometry.nodes:
-                continue  # held back, or the segment has ended
-            T_map_odom, map_id = self._graph.T_map_odom(last), self._graph.map_id(segment)
+        for segment, (last, cov) in passed.items():
+            agent, map_id = odometry.segments[segment].agent, graph.map_id(segment)
             about_id, answered_id = odometry.nodes[last].key.id, answered_ids.get(agent, -1)
             try:
-                out[agent] = Correction(T_map_odom, cov, map_id, 0, about_id, answered_id)
+                out[agent] = Correction(shown[segment], cov, map_id, 0, about_id, answered_id)
             except ValueError as error:
                 failed[agent] = f"no correction: {error}"
         return out, failed
+
+    def _solved_place(self, node_id: int, cov: F64) -> SolvedPlace:
+        """Where a segment is by its newest solved node. cov (6, 6): of T_map_odom."""
+        graph, T_odom_body = self._graph, self._graph.odometry.nodes[node_id].T_odom_body
+        previous = graph.odometry.previous_node(node_id)
+        step_cov = cov if previous is None else graph.odometry_edge(previous, node_id).cov
+        sigma_m = sigma_ahead(se3.inverse_cov(se3.inverse(T_odom_body), cov))
+        variance = max(_MIN_STEP_VARIANCE, se3.position_sigma(step_cov) ** 2)
+        return SolvedPlace(graph.T_map_odom(node_id), T_odom_body, sigma_m, variance)

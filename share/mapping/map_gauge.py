@@ -1,0 +1,83 @@
+"""The gauge: where a map as a whole lies in the frame that its agents are shown.
+
+What is measured in a map is relative, so where it lies as a whole is a convention. Were it fixed by one
+keyframe, the whole map would move whenever the way from there to where the agents are becomes better known:
+all would see it move, though nothing changes between them. So the frame that is shown may lie off the one in
+which the map is solved: a solution is put where it moves those in it least, the surest odometry least of all
+(as the inner constraints of a free network do; Meissl, 1969). But no further off than the agents' places are
+uncertain: a drift that is known is corrected, for all alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.geometry import se3
+from share.types import F64
+
+AHEAD_M = 3.0  # what a wearer looks at: a turn counts by this lever
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPlace:
+    """Where a solution puts an agent.
+
+    T_map_odom, T_odom_body (4, 4): at its newest keyframe. sigma_m: of what is ahead of it
+    (`share.mapping.localisation_gate.sigma_ahead`). step_variance: of the position after the newest step of
+    its odometry, m^2.
+    """
+
+    T_map_odom: F64
+    T_odom_body: F64
+    sigma_m: float
+    step_variance: float
+
+
+class MapGauge:
+    """Remembers where each segment was shown."""
+
+    def __init__(self) -> None:
+        self._shown: dict[int, tuple[int, F64]] = {}  # by segment: reference segment, T_map_odom as shown
+
+    def forget_all_but(self, segments: Collection[int]) -> None:
+        """Forget all but these segments: the others have no keyframes."""
+        self._shown = {s: shown for s, shown in self._shown.items() if s in segments}
+
+    def show(self, reference_segment: int, places: Mapping[int, SolvedPlace]) -> dict[int, F64]:
+        """Return T_map_odom (4, 4) to show to each segment of a map, for places as solved."""
+        known = [s for s in places if self._shown.get(s, (None,))[0] == reference_segment]
+        T_shown_map = np.eye(4)
+        if known:
+            T_shown_map = _gauge([places[s] for s in known], [self._shown[s][1] for s in known])
+        shown = {s: se3.orthonormal(T_shown_map @ place.T_map_odom) for s, place in places.items()}
+        self._shown |= {s: (reference_segment, T) for s, T in shown.items()}
+        return shown
+
+
+def _gauge(places: list[SolvedPlace], shown: list[F64]) -> F64:
+    """Return T_shown_map (4, 4) that moves these agents least from T_map_odom as shown before, as far as they
+    are uncertain."""
+    solved_body = np.array([place.T_map_odom @ place.T_odom_body for place in places])
+    shown_body = np.array([T @ place.T_odom_body for T, place in zip(shown, places, strict=True)])
+    weights = 1 / np.array([place.step_variance for place in places])
+    T = _least_motion(solved_body, shown_body, weights / weights.sum())
+    about = se3.from_rt(np.eye(3), solved_body[:, :3, 3].mean(axis=0))
+    way = se3.log(se3.inverse(about) @ T @ about)
+    length_m = float(np.linalg.norm(way[3:]) + AHEAD_M * np.linalg.norm(way[:3]))
+    most_m = float(np.median([place.sigma_m for place in places]))
+    return about @ se3.exp(way * min(1.0, most_m / max(length_m, 1e-12))) @ se3.inverse(about)
+
+
+def _least_motion(poses: F64, goals: F64, weights: F64) -> F64:
+    """Return the turn about the vertical and the translation (4, 4) that bring poses (N, 4, 4), and what is
+    ahead of them, nearest to their goals, (N, 4, 4). weights (N,): their sum is 1."""
+    centre, goal_centre = weights @ poses[:, :3, 3], weights @ goals[:, :3, 3]
+    arms, goal_arms = poses[:, :3, 3] - centre, goals[:, :3, 3] - goal_centre
+    turns = np.tensordot(weights, goals[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2), 1)
+    M = goal_arms.T @ (weights[:, None] * arms) + AHEAD_M**2 / 2 * turns
+    angle = np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])
+    R = se3.so3_exp(np.array([0.0, 0.0, angle]))
+    return se3.from_rt(R, goal_centre - R @ centre)
