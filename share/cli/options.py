@@ -94,8 +94,9 @@ _policy_option = click.option(
 link = click.option(
     "--link",
     metavar="LINK[,AGENT=LINK…]",
-    help="Emulated network: wifi5 (an access point alone), wifi-busy (shared with many devices) or a YAML "
-    "file (docs/do/network.md); one for all agents, or one per agent.",
+    help="Emulated network: wifi5 (an access point alone), wifi-busy (shared with many devices), with "
+    "--virtual shared-5, shared-8, shared-15, shared-150 (one access point of so many Mbit/s for all), or a "
+    "YAML file (docs/do/network.md); one for all agents, or one per agent.",
 )
 true_error = click.option(
     "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
@@ -244,7 +245,7 @@ def load_run_config(
 
     config, links = load_config(config_file, policies), LinkAssignment.parse(options_given["link"])
     for session in sessions:
-        links.check(session.agents)
+        links.check(session.agents, options_given["virtual"])
     if options_given["costs"] is not None:
         from share.lab.evaluate.virtual_time import read_delays
 

@@ -99,7 +99,7 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         known = truth_of(made, NEAR_M, config.control.far_m)
         mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     links = LinkAssignment.parse(link)
-    links.check(made.agents)
+    links.check(made.agents, virtual=True)
     networks = [links.network_for(agent.hello.name) for agent in who]
     members = list(zip((a.hello for a in who), seen, networks, strict=True))
     world = Simulation(config, members, ProcessingDelays(), seed, mapper)

@@ -20,6 +20,7 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
+from share.lab.evaluate.shared_air import SharedAir
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
@@ -42,6 +43,7 @@ from share.wire.messages import Hello, peer_id
 _MS = 1_000_000
 _TICK_MS = 50
 _RANDOM_BATCH = 1000
+_ACCESS_POINT = ""  # a station beside the agents, which go by name
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,10 @@ class Simulation:
             member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
             self._members[member.peer] = member
             self._schedule_next_frame(member)
+        self.airs: dict[NetworkModel, SharedAir] = {}  # of the access points
+        for network in dict.fromkeys(network for *_, network in agents):
+            if network.air is not None:
+                self.airs[network] = SharedAir(network.air, rng.spawn(1)[0], self._schedule)
         kept = StoredMap() if store is None else store.load()
         restored = restored_runs(kept, config.merge.enter_m)
         self._store = store
@@ -242,12 +248,24 @@ class Simulation:
                         log.add_correction(effect.stamp_ns, effect.corrected_ms)
 
     def _send_up(self, member: _SimulatedAgent, frames: Sequence[Bytes]) -> None:
-        arrival_ns = member.up.arrival_ns(message_bytes(frames), self.now_ns) + self._draw(
-            self._delays.receive
-        )
-        self._schedule(
-            arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
-        )
+        size = message_bytes(frames)
+
+        def on_air_done() -> None:
+            arrival_ns = member.up.arrival_ns(size, self.now_ns) + self._draw(self._delays.receive)
+            self._schedule(
+                arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
+            )
+
+        self._over_the_air(member, member.name, size, on_air_done)
+
+    def _over_the_air(
+        self, member: _SimulatedAgent, station: str, size: int, done: Callable[[], None]
+    ) -> None:
+        """Call `done` when a message has passed the shared air of this member, at once without one."""
+        if (air := self.airs.get(member.network)) is None:
+            done()
+        else:
+            air.send(station, member.name, size, done)
 
     # The edge.
 
@@ -266,10 +284,15 @@ class Simulation:
 
     def _send_down(self, effect: ed.SendToPeer) -> None:
         member, frames = self._members[effect.peer_id], effect.frames
-        arrival_ns = member.down.arrival_ns(message_bytes(frames), self.now_ns)
-        self._schedule(
-            arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
-        )
+        size = message_bytes(frames)
+
+        def on_air_done() -> None:
+            arrival_ns = member.down.arrival_ns(size, self.now_ns)
+            self._schedule(
+                arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
+            )
+
+        self._over_the_air(member, _ACCESS_POINT, size, on_air_done)
 
     def _apply_to_mapper(
         self, message: ed.AddRun | ed.SetPresence | ed.AddKeyframe | ed.DropRun
@@ -382,7 +405,7 @@ class _SimulatedAgent:
         rngs: list[np.random.Generator],
     ) -> None:
         self.name, self.peer = hello.name, peer_id(hello.run_id)
-        self.machine, self.incoming = machine, incoming
+        self.machine, self.incoming, self.network = machine, incoming, network
         self.up = Channel(network.up, network.round_trip_ms, rngs[0])
         self.down = Channel(network.down, network.round_trip_ms, rngs[1])
         self.busy_until_ns = self.frames_count = 0

@@ -69,7 +69,7 @@ def play_in_virtual_time(
     tracker_settings = settings.tracker, settings.inertial, settings.sequencer
     tracked = track_session(session.folder.resolve(), *tracker_settings, error_source)
     links = LinkAssignment.parse(options.link)
-    links.check(session.agents)
+    links.check(session.agents, virtual=True)
     start_ns = min(frames[0].arrival_ns for _, frames in tracked.values() if frames)
     members = [
         (
