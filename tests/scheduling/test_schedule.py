@@ -14,8 +14,8 @@ from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
 from share.scheduling.merge_gate import MergeGate
 from share.scheduling.policies import POLICIES, AgentReport
-from share.scheduling.rate_scheduler import RateScheduler
 from share.scheduling.qoe import QoeParameters, qoe
+from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import RingBuffer
 from share.types import AgentKind
 from share.wire import messages as m
@@ -64,8 +64,9 @@ def test_each_evaluation_is_answered_and_recorded() -> None:
 
 def test_a_new_run_starts_without_history() -> None:
     edge = welcomed("share")
-    for i in range(20):
-        (last,) = rates(edge, 15.0, 0.1, 200 * i)
+    told = [hz for i in range(20) for hz in rates(edge, 15.0, 0.1, 200 * i)]
+    assert told == sorted(told, reverse=True) and len(told) < 20  # an unchanged rate is not sent again
+    last = told[-1]
     edge.handle(ed.PeerMessageReceived(b"a", encode(m.Bye())), 4000 * MS)
     edge.handle(ed.PeerMessageReceived(b"b", encode(hello_of("ann", 6))), 4001 * MS)
     reported = edge.report({})["agents"]
