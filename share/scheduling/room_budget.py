@@ -7,7 +7,7 @@ depend on the load, so rates that follow from it do not swing.
 
 Where keyframes at the rates that all want take longer than a wearer notices, every agent begins with its
 least rate. What is left goes in small steps to whom a step gains most for its air, as long as nobody notices;
-then only where a step gains one more QoE than the delay that it causes costs all.
+then only where a step gains a headset more QoE than the delay that it causes costs all.
 """
 
 from __future__ import annotations
@@ -140,13 +140,21 @@ class _Prediction:
                 for name, hz in rates.items()
                 if hz + _STEP_HZ <= self._agents[name].wanted_hz
             }
-            best = max(gains, key=lambda name: gains[name], default=None)
-            if best is None or load >= _MAX_LOAD:
+            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n)}
+            worth = {n: gain for n, gain in gains.items() if gain > _STEP_HZ * cost and self._comes_first(n)}
+            steps = free or worth
+            if not steps or load >= _MAX_LOAD:
                 return rates
-            stepped = {**rates, best: rates[best] + _STEP_HZ}
-            if gains[best] <= _STEP_HZ * cost and self.is_noticed(stepped):
-                return rates
-            rates = stepped
+            best = max(steps, key=lambda name: steps[name])
+            rates = {**rates, best: rates[best] + _STEP_HZ}
+
+    def _is_step_noticed(self, rates: Mapping[str, float], name: str) -> bool:
+        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ})
+
+    def _comes_first(self, name: str) -> bool:
+        """Return whether others may be delayed for an agent: for headsets, and among robots alone."""
+        form = self._agents[name].terms.form
+        return form is AgentKind.AR or all(agent.terms.form is form for agent in self._agents.values())
 
     def _gain(self, name: str, hz: float, load: float) -> float:
         """Return what a step of its rate gains an agent, weighted, at the same load."""
