@@ -186,6 +186,7 @@ class _Prediction:
 
 
 _PERIOD_NS = 500_000_000  # between two allocations
+_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: it has its least rate
 
 
 class Room:
@@ -220,6 +221,8 @@ class Room:
             updated_ns=now_ns,
         )
         self._budget = self._budget.with_report(name, reported)
+        if counts[0] < _SLOW_START_KEYFRAMES:
+            return scarce_grant(terms.form)
         if not self._budget.is_short:
             self._grants = {}
             return Grant(wanted_hz)

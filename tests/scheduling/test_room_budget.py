@@ -68,6 +68,12 @@ class Air:
             self.history.append([g.hz for g in self.grants])
 
 
+def test_an_agent_whose_air_is_not_known_has_its_least_rate() -> None:
+    told = Evaluation(0, 20.0, 1.0)
+    grants = [Room().grant("a0", TERMS[AR], 5.0, told, (n, 0), S) for n in range(3)]
+    assert grants == [scarce_grant(AR), scarce_grant(AR), Grant(5.0)]
+
+
 def test_with_ample_air_everyone_gets_what_it_wants() -> None:
     air = Air(2.0, (AR, AR, ROBOT) * 4)
     air.play(20)

@@ -33,7 +33,7 @@ def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> Edge:
 
 
 def rates(edge: Edge, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
-    told = encode(m.Evaluation(0, delay_ms, error_cm))
+    told = encode(m.Evaluation(0, delay_ms, error_cm, rtt_ms=delay_ms))
     effects = edge.handle(ed.PeerMessageReceived(b"a", told), now_ms * MS)
     said = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return [message.hz for message in said if isinstance(message, m.Rate)]
@@ -50,7 +50,7 @@ def test_without_a_limit_no_rate_is_sent_but_qoe_is_reported() -> None:
 
 
 def test_each_evaluation_is_answered_and_recorded() -> None:
-    edge = welcomed("share")
+    edge = welcomed("share-paper")
     told = [rates(edge, 15.0, error, 200 * i) for i, error in enumerate((0.3, 0.3, 0.3, 2.0, 2.0))]
     assert [len(each) for each in told] == [1] * 5
     content, wanting = [hz for (hz,) in told[:3]], [hz for (hz,) in told[3:]]
@@ -63,7 +63,7 @@ def test_each_evaluation_is_answered_and_recorded() -> None:
 
 
 def test_a_new_run_starts_without_history() -> None:
-    edge = welcomed("share")
+    edge = welcomed("share-paper")
     told = [hz for i in range(20) for hz in rates(edge, 15.0, 0.1, 200 * i)]
     assert told == sorted(told, reverse=True) and len(told) < 20  # an unchanged rate is not sent again
     last = told[-1]
