@@ -21,7 +21,7 @@ from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
-SCARCE_POSE_HZ = {AgentKind.AR: 10.0, AgentKind.ROBOT: 5.0}  # what draws them interpolates
+SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 _POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame

@@ -43,7 +43,7 @@ class Air:
     def __init__(self, alone_ms: float, kinds: tuple[AgentKind, ...], wanted_hz: float = 1.5) -> None:
         self.alone_ms, self.kinds, self.wanted_hz = alone_ms, kinds, wanted_hz
         self.room, self.now_s = Room(), 0.0
-        self.counts = [[0.0, 0.0] for _ in kinds]
+        self.counts = [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
         self.grants = [scarce_grant(kind) for kind in kinds]
         self.history: list[list[float]] = []
 
