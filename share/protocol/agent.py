@@ -187,9 +187,7 @@ class Agent:
         if sent:
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
             self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
-            self._self_evaluation.drift.add_keyframe(keyframe, frame.arrived_ns)
-            self._self_evaluation.delay.add_keyframe(keyframe.id, frame.arrived_ns, self._now_ns)
-            self._self_evaluation.local_cm = frame.error_cm
+            self._self_evaluation.add_keyframe(keyframe, frame, self._now_ns)
             self._send_evaluation(keyframe.id)
         else:
             self._counts["drop_rate"] += 1
@@ -203,11 +201,8 @@ class Agent:
 
     def evaluation(self, keyframe: int, now_ns: int) -> m.Evaluation | None:
         """Return how the agent is served at `now_ns`; None before the first keyframe and round trip."""
-        rtt_ms, T_odom_body = self._pings.clock.rtt_ms, self._localisation.T_odom_body
-        if rtt_ms is None:
-            return None
-        sigma_cm = 0.0 if T_odom_body is None else self._localisation.map_frame.sigma_cm(T_odom_body)
-        return self._self_evaluation.evaluation(keyframe, rtt_ms, sigma_cm, now_ns)
+        rtt_ms = self._pings.clock.rtt_ms
+        return self._self_evaluation.evaluation(keyframe, rtt_ms, self._localisation, now_ns)
 
     def _finish_frame(self, frame: ev.FrameTracked, sent: bool) -> None:
         self._effects.append(

@@ -171,15 +171,21 @@ class SelfEvaluation:
         """Add the time from a frame's arrival to its candidate, ms."""
         self._processing_ms = exponential_average(self._processing_ms, ms)
 
+    def add_keyframe(self, keyframe: Keyframe, frame: ev.FrameTracked, now_ns: int) -> None:
+        """Add a keyframe that is sent now, made of a frame."""
+        self.drift.add_keyframe(keyframe, frame.arrived_ns)
+        self.delay.add_keyframe(keyframe.id, frame.arrived_ns, now_ns)
+        self.local_cm = frame.error_cm
+
     def evaluation(
-        self, keyframe: int, rtt_ms: float, map_sigma_cm: float, now_ns: int
+        self, keyframe: int, rtt_ms: float | None, localisation: MapLocalisation, now_ns: int
     ) -> m.Evaluation | None:
         """Return the evaluation to send with `keyframe`, or between two if -1, within the bounds of the wire;
-        None before the first keyframe.
-
-        map_sigma_cm: as in `MapFrame.sigma_cm`."""
-        if (delay_ms := self.delay.ms(now_ns)) is None:
+        None before the first keyframe and round trip."""
+        if rtt_ms is None or (delay_ms := self.delay.ms(now_ns)) is None:
             return None
+        T_odom_body = localisation.T_odom_body
+        map_sigma_cm = 0.0 if T_odom_body is None else localisation.map_frame.sigma_cm(T_odom_body)
         drift_cm, error_cm = self.drift.expected_cm(self.local_cm, now_ns), None
         if drift_cm is not None:
             error_cm = min(math.hypot(drift_cm, map_sigma_cm), m.MAX_ERROR_CM)

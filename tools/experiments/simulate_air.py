@@ -42,7 +42,8 @@ from tool_main import exit_code, line  # noqa: E402
 from share.config import NEAR_M, Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.lab.evaluate.emulated_network import load_network  # noqa: E402
-from share.lab.evaluate.simulation import ProcessingDelays, Simulation  # noqa: E402
+from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
+from share.lab.evaluate.simulation import Simulation  # noqa: E402
 from share.protocol import agent_events as ev  # noqa: E402
 from share.protocol.agent import Agent  # noqa: E402
 from share.scheduling.qoe import QoeParameters, qoe  # noqa: E402
@@ -63,7 +64,7 @@ class SampledSimulation(Simulation):
         self.samples: dict[str, list[tuple[float, ...]]] = {}
         self._corrected_s: dict[str, float] = {}
         self._ticks = 0
-        super().__init__(*arguments, on_effect=self._note, **named)
+        super().__init__(*arguments, **{**named, "on_effect": self._note})
 
     def _note(self, name: str, effect: ev.AgentEffect) -> None:
         if isinstance(effect, ev.CorrectionApplied) and effect.corrected_ms is not None:

@@ -13,7 +13,8 @@ from helpers.room_simulation import MS, tracked_frames
 from share.config import Config, EdgeConfig
 from share.geometry.camera import Camera
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
-from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation
+from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.simulation import Simulation
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
