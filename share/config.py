@@ -190,8 +190,8 @@ class ControlConfig:
     kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
     ki: float = 0.15  # the same, of an error of 1 for a second
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
-    rate_min_hz: float = 1.5  # lowest rate of an agent
-    rate_max_hz: float = 5.0  # highest rate of an agent, and its initial one
+    rate_min_hz: float = 1.5  # lowest rate by QoE; only where the air is short are there lower ones
+    rate_max_hz: float = 5.0  # highest rate of an agent, and the initial one by QoE
     fixed_rate_hz: float = 1.5  # rate of every agent by policy fixed
     random_seed: int = 1  # of the merge gate and of policy random
     far_m: float = 5.0  # far plane of the view frusta; the near one is at 0.3 m
