@@ -123,7 +123,16 @@ class MergeConfig:
 
 
 STREAMED = "streamed"
-POLICY_NAMES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.scheduling.policies`
+POLICY_NAMES = (
+    "share",
+    "share-paper",
+    "covins-g",
+    "linear",
+    "equal",
+    "random",
+    "fixed",
+    STREAMED,
+)  # see `share.scheduling.policies`
 
 
 @dataclass(frozen=True)
@@ -181,8 +190,9 @@ class ControlConfig:
     kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
     ki: float = 0.15  # the same, of an error of 1 for a second
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
-    rate_min_hz: float = 1.5  # lowest rate of an agent
-    rate_max_hz: float = 5.0  # highest rate of an agent, and its initial one
+    rate_min_hz: float = 1.5  # lowest rate by QoE; only where the air is short are there lower ones
+    rate_max_hz: float = 5.0  # highest rate of an agent, and the initial one by QoE
+    fixed_rate_hz: float = 1.5  # rate of every agent by policy fixed
     random_seed: int = 1  # of the merge gate and of policy random
     far_m: float = 5.0  # far plane of the view frusta; the near one is at 0.3 m
     merges: int = 20  # completed merges in the mean overlap that a new one is compared with (N)
@@ -190,6 +200,7 @@ class ControlConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
+        _require_positive(self, "fixed_rate_hz")
         if not self.far_m > NEAR_M:
             raise ValueError(f"far_m: {self.far_m} m is not beyond the near plane, {NEAR_M} m")
         if not self.rate_min_hz <= self.rate_max_hz <= 1000:

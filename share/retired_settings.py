@@ -126,7 +126,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "control.gap_s": "scheduling.policies.GAP_S",
     "control.interval_m": "scheduling.merge_gate.INTERVAL_M",
     # agent
-    "agent.rate_burst": "protocol.agent.RATE_BURST",
+    "agent.rate_burst": "protocol.keyframe_pace.RATE_BURST",
     "agent.blend_jump_m": "protocol.localisation.JUMP_M",
     "agent.blend_jump_rad": "protocol.localisation.JUMP_M",  # a rotation counts by its lever
     # link

@@ -212,9 +212,10 @@ def _true_error(source: Source) -> ErrorEstimator:
 
 def _emulated_link(connect_edge: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
     """Return `connect_edge` with an emulated network around its link. Raises UsageError, ConfigError."""
-    from share.lab.evaluate.emulated_network import EmulatedLink, load_network
+    from share.lab.evaluate.emulated_network import EmulatedLink, check_air_is_own, load_network
 
     link_network = load_network(name)
+    check_air_is_own(name, link_network)
     return lambda: EmulatedLink(connect_edge(), link_network, seed)
 
 

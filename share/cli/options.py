@@ -80,10 +80,12 @@ rotations = click.option(
 )
 POLICY_TEXTS = {
     "share": "rate of each agent by its quality of experience; merges with a small gain are skipped",
+    "share-paper": "the paper's algorithm to the letter: no budget of the room, low QoE raises the rate",
     "covins-g": "every keyframe is sent, every verified loop is merged",
     "linear": "rate falls with the delay; merges as share",
     "equal": "as share, robots rated like headsets",
     "random": "as share, with control gains drawn from control.random_seed",
+    "fixed": "every agent sends control.fixed_rate_hz",
     STREAMED: "agents send raw frames; the edge tracks each alone, without a shared map",
 }
 _policy_option = click.option(
@@ -94,8 +96,9 @@ _policy_option = click.option(
 link = click.option(
     "--link",
     metavar="LINK[,AGENT=LINK…]",
-    help="Emulated network: wifi5 (an access point alone), wifi-busy (shared with many devices) or a YAML "
-    "file (docs/do/network.md); one for all agents, or one per agent.",
+    help="Emulated network: wifi5 (an access point alone), wifi-busy (shared with many devices), with "
+    "--virtual shared-5, shared-8, shared-15, shared-150 (one access point of so many Mbit/s for all), or a "
+    "YAML file (docs/do/network.md); one for all agents, or one per agent.",
 )
 true_error = click.option(
     "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
@@ -244,7 +247,7 @@ def load_run_config(
 
     config, links = load_config(config_file, policies), LinkAssignment.parse(options_given["link"])
     for session in sessions:
-        links.check(session.agents)
+        links.check(session.agents, options_given["virtual"])
     if options_given["costs"] is not None:
         from share.lab.evaluate.virtual_time import read_delays
 

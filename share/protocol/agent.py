@@ -15,21 +15,22 @@ from share.config import Config
 from share.errors import UsageError, VersionError, WireError, printable
 from share.metrics.frame_log import summary
 from share.protocol import agent_events as ev
-from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, KeyframeScore, LedgerEntry
+from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
 from share.protocol.agent_status import StatusReporter
 from share.protocol.edge_clock import ClockEstimate, PingTracker
 from share.protocol.edge_sessions import EdgeSessions
+from share.protocol.keyframe_pace import KeyframePace
 from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
 from share.protocol.versions import EdgeVersionProbe
-from share.timing import LineLimiter, PeriodicTimer, TokenBucket, seconds_to_ns
-from share.types import F64, Correction, Keyframe, KeyframeCandidate
+from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
+from share.types import F64, Correction, KeyframeCandidate
 from share.wire import messages as m
 from share.wire.codec import Bytes, decode, encode, message_bytes
 
 HELLO_S = 0.5  # interval of hellos, until welcomed
 REFUSED_S = 5.0  # a running agent that was refused asks again after this
-RATE_BURST = 2.0  # keyframes that may be saved up under a rate limit
-_MIN_RATE_HZ = 0.1  # that an edge cannot undercut: without keyframes it could not evaluate again
+EVALUATION_S = 1.0  # longest interval of evaluations: with few keyframes the edge has to know sooner
+NO_KEYFRAME = -1  # of an evaluation between keyframes
 _COUNTERS = (
     *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
     *("corrections", "corrections_stale"),
@@ -57,11 +58,11 @@ class Agent:
     def __init__(self, hello: m.Hello, config: Config) -> None:
         self._config = config
         self._name, self._hello = hello.name, encode(hello)
-        self._keyframe_chain, self._keyframe_score = KeyframeChain(), KeyframeScore()
-        self._bucket = TokenBucket(RATE_BURST)
+        self._keyframe_chain, self._pace = KeyframeChain(), KeyframePace()
         self._ledger = KeyframeLedger(config.agent.keep_keyframes, config.link.window)
         self._localisation = MapLocalisation(config.agent.blend_s)
         self._self_evaluation = SelfEvaluation()
+        self._evaluation_timer = PeriodicTimer(EVALUATION_S)
         self._status_reporter = StatusReporter(self.slow_text)
         # the edge
         self._is_connected = False
@@ -131,7 +132,7 @@ class Agent:
             "kept": len(self._ledger),
             "unacknowledged": self._ledger.unacknowledged,
             "buffered_at_edge": self._ledger.buffered_at_edge,
-            "rate_hz": self._bucket.hz,
+            "rate_hz": self._pace.hz,
             "connected": self._is_connected,
             "edge_session": self._sessions.session,
             "edge_sessions": len(self._sessions),
@@ -157,6 +158,7 @@ class Agent:
 
     def _on_frame_tracked(self, frame: ev.FrameTracked) -> None:
         self._status_reporter.add_frame(frame, self._now_ns)
+        self._self_evaluation.local_cm = frame.error_cm
         if frame.new_segment:
             self._keyframe_chain.begin_segment()
             self._localisation.begin_segment()
@@ -167,7 +169,7 @@ class Agent:
 
     def _publish_pose(self, frame: ev.FrameTracked, T_odom_body: F64) -> None:
         self._effects.append(self._localisation.localise(frame, T_odom_body, self._now_ns))
-        if self._is_connected and self.makes_keyframes:
+        if self._is_connected and self.makes_keyframes and self._pace.take_pose(self._now_ns):
             self._counts["poses"] += 1
             last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
             self._send(pose_update(frame, T_odom_body, last, first))
@@ -180,23 +182,27 @@ class Agent:
         self._counts["candidates"] += 1
         self._self_evaluation.add_processing_time((self._now_ns - frame.arrived_ns) / 1e6)
         self._keyframe_chain.extend(candidate)
-        sent = self._bucket.take(self._now_ns, self._keyframe_score.is_above_median(candidate))
+        unacknowledged = len(self._ledger.pending) if self._is_connected else 0
+        sent = self._pace.take(candidate, unacknowledged, self._now_ns)
         if sent:
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
             self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
-            self._self_evaluation.drift.add_keyframe(keyframe, frame.arrived_ns)
-            self._send_evaluation(keyframe, frame.error_cm)
+            self._self_evaluation.add_keyframe(keyframe, frame, self._now_ns)
+            self._send_evaluation(keyframe.id)
         else:
             self._counts["drop_rate"] += 1
         self._finish_frame(frame, sent)
 
-    def _send_evaluation(self, keyframe: Keyframe, error_cm: float | None) -> None:
-        """Send delay and error with a keyframe. error_cm: expected error of odometry; None: unknown."""
-        rtt_ms, T_odom_body = self._pings.clock.rtt_ms, self._localisation.T_odom_body
-        if not self._is_connected or rtt_ms is None:
-            return
-        sigma_cm = 0.0 if T_odom_body is None else self._localisation.map_frame.sigma_cm(T_odom_body)
-        self._send(self._self_evaluation.evaluation(keyframe.id, rtt_ms, error_cm, sigma_cm, self._now_ns))
+    def _send_evaluation(self, keyframe: int) -> None:
+        """Send delay and error with a keyframe, or between two if -1."""
+        self._evaluation_timer.postpone(self._now_ns + seconds_to_ns(EVALUATION_S))
+        if self._is_connected and (evaluation := self.evaluation(keyframe, self._now_ns)) is not None:
+            self._send(evaluation)
+
+    def evaluation(self, keyframe: int, now_ns: int) -> m.Evaluation | None:
+        """Return how the agent is served at `now_ns`; None before the first keyframe and round trip."""
+        rtt_ms = self._pings.clock.rtt_ms
+        return self._self_evaluation.evaluation(keyframe, rtt_ms, self._localisation, now_ns)
 
     def _finish_frame(self, frame: ev.FrameTracked, sent: bool) -> None:
         self._effects.append(
@@ -221,16 +227,22 @@ class Agent:
             case m.Refused():
                 self._on_refused(message)
             case m.Ack():  # one of an earlier session is rejected, but is no fault
-                if not self._ledger.acknowledge(message):
-                    self._is_of_sent("an acknowledgement", message.next_keyframe - 1, *message.buffered)
+                self._on_ack(message)
             case Correction():
                 self._on_correction(message)
             case m.Rate():
-                self._bucket.set_rate(max(message.hz, _MIN_RATE_HZ), self._now_ns)
+                self._pace.set_rate(message, self._now_ns)
             case m.Pong():
                 self._on_pong(message)
             case _:
                 self._on_other_message(message)
+
+    def _on_ack(self, ack: m.Ack) -> None:
+        if not self._ledger.acknowledge(ack):
+            self._is_of_sent("an acknowledgement", ack.next_keyframe - 1, *ack.buffered)
+            return
+        acks_ms = self._self_evaluation.delay.acknowledge(ack.next_keyframe, self._now_ns)
+        self._pace.acknowledge(acks_ms, self._now_ns)
 
     def _on_other_message(self, message: m.Message) -> None:
         name = type(message).__name__
@@ -280,7 +292,7 @@ class Agent:
         is_restart = self._sessions.session is not None
         self._sessions.begin(welcome.session)
         self._refusal = None
-        self._bucket.set_rate(None, self._now_ns)
+        self._pace.begin_session(self._now_ns)
         self._pings.begin_session()
         pending = self._ledger.begin_session(welcome)
         if is_restart:
@@ -316,6 +328,8 @@ class Agent:
         self._counts["corrections"] += 1
         self._self_evaluation.drift.correct(answered)
         entry, corrected_ms = self._ledger.record_correction(answered, self._now_ns)
+        if corrected_ms is not None:
+            self._self_evaluation.delay.correct(answered, corrected_ms, self._now_ns)
         applied = self._localisation.apply_correction(correction, entry, corrected_ms, self._now_ns)
         self._effects.append(applied)
 
@@ -336,6 +350,8 @@ class Agent:
             if (ping := self._pings.due_ping(self._now_ns)) is not None:
                 self._send(ping)
             self._send_data()
+            if self.makes_keyframes and self._evaluation_timer.fire_if_due(self._now_ns):
+                self._send_evaluation(NO_KEYFRAME)
         elif self._hello_timer.fire_if_due(self._now_ns):
             self._send_hello()
         deadline_ns = self._finish_deadline_ns
@@ -343,7 +359,7 @@ class Agent:
             self._finish()
 
     def _send_data(self) -> None:
-        for entry in self._ledger.take_due(self._now_ns):
+        for entry in self._ledger.take_due(self._now_ns, self._pace.window):
             self._send_frames(encode(entry.keyframe), entry.keyframe.id)
 
     @property

@@ -99,9 +99,12 @@ class KeyframeLedger:
         if len(self) > self._capacity:
             self._drop_oldest()
 
-    def take_due(self, now_ns: int) -> list[LedgerEntry]:
-        """Return what to send now, in order. It counts as sent unless `record_send_failure` follows."""
-        due = [entry for entry in self.pending[: self._window] if self._is_due(entry, now_ns)]
+    def take_due(self, now_ns: int, window: int | None = None) -> list[LedgerEntry]:
+        """Return what to send now, in order. It counts as sent unless `record_send_failure` follows.
+
+        window: keyframes in flight, if fewer than the ledger's."""
+        window = self._window if window is None else min(window, self._window)
+        due = [entry for entry in self.pending[:window] if self._is_due(entry, now_ns)]
         for entry in due:
             self._count_sends(entry, 1)
             backoff = RESEND_S * 2.0 ** min(entry.attempts, 30)

@@ -24,7 +24,9 @@ from share.protocol.edge_records import DurabilityTracker, EventLog
 from share.protocol.keyframe_intake import KeyframeQuota, OdometryBase, sanitise
 from share.protocol.peer import Peer, RestoredRun, Sender, fault_warnings
 from share.protocol.versions import refusal_of_version
-from share.scheduling.policies import RateScheduler
+from share.scheduling.policies import AgentReport
+from share.scheduling.rate_scheduler import RateScheduler
+from share.scheduling.room_budget import Grant
 from share.timing import Throttle, seconds_to_ns
 from share.types import Keyframe
 from share.wire import messages as wire
@@ -166,10 +168,16 @@ class Edge:
 
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
-        now_ns, t_s = self._now_ns, self._event_log.elapsed_s(self._now_ns)
-        rate_hz = self._rate_scheduler.evaluate(peer.name, peer.hello.kind, evaluation, now_ns, t_s)
-        if rate_hz is not None:
-            self._send(peer.id, wire.Rate(rate_hz))
+        arrived = peer.counts["keyframes"], peer.counts["poses"]
+        report = AgentReport(peer.hello.kind, evaluation, self._now_ns, *arrived)
+        t_s = self._event_log.elapsed_s(self._now_ns)
+        self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
+
+    def _send_grant(self, peer: Peer, grant: Grant | None) -> None:
+        """Send what an agent may send, if that has changed; None: everything, which needs no message."""
+        if grant is not None and grant != peer.grant:
+            self._send(peer.id, wire.Rate(grant.hz, self._rate_scheduler.is_windowed, grant.pose_hz))
+            peer.grant = grant
 
     def _on_other_version(self, peer_id: bytes, error: VersionError) -> None:
         self._unjoined.counts["other_version"] += 1
@@ -219,6 +227,8 @@ class Edge:
         """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
         peer.is_welcomed = True
         self._send(peer.id, wire.Welcome(self._session, peer.durable_below))
+        peer.grant = None
+        self._send_grant(peer, self._rate_scheduler.first_grant(peer.name, peer.hello.kind))
         if peer.last_finding is not None:
             self._send_correction(peer, peer.last_finding, is_repeat=True)
 
@@ -282,6 +292,7 @@ class Edge:
         applicable = self._reorder(peer, keyframe)
         for ready in applicable:
             peer.counts["keyframes"] += 1
+            peer.computation.add_keyframe(ready.id, self._now_ns)
             self._apply(peer, ready)
             self._durability.add_keyframe(peer, ready.id)
         self._acknowledge(*self._durability.take_durable())
@@ -351,6 +362,7 @@ class Edge:
         peer.revision += 1
         peer.counts["corrections"] += 1
         correction = replace(finding.correction, revision=peer.revision)
+        peer.computation.answer(correction.answered_keyframe, self._now_ns)
         self._send(peer.id, correction)
         answered = {"revision": peer.revision, "answers": correction.answered_keyframe}
         self._record(finding.event, peer, finding.reason, is_repeat, map_id=correction.map_id, **answered)

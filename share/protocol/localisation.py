@@ -12,6 +12,7 @@ from share.geometry.se3 import compose_cov, inverse, position_sigma
 from share.metrics.local_error import WINDOW_S
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import LedgerEntry
+from share.protocol.correction_delay import CorrectionDelay
 from share.protocol.edge_clock import exponential_average
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import F64, Correction, Keyframe
@@ -158,27 +159,45 @@ def pose_update(
 
 
 class SelfEvaluation:
-    """Estimates the delay and error that the agent reports with each keyframe. `drift` grows with odometry
-    and is reset by corrections."""
+    """Estimates the delay and error that the agent reports. `drift` grows with odometry and is reset by
+    corrections. local_cm: of the newest frame, as in `DriftEstimator.expected_cm`."""
 
     def __init__(self) -> None:
-        self.drift = DriftEstimator()
+        self.drift, self.delay = DriftEstimator(), CorrectionDelay()
+        self.local_cm: float | None = None
         self._processing_ms: float | None = None  # average
 
     def add_processing_time(self, ms: float) -> None:
         """Add the time from a frame's arrival to its candidate, ms."""
         self._processing_ms = exponential_average(self._processing_ms, ms)
 
-    def evaluation(
-        self, keyframe: int, rtt_ms: float, local_cm: float | None, map_sigma_cm: float, now_ns: int
-    ) -> m.Evaluation:
-        """Return the evaluation to send with `keyframe`, within the bounds of the wire.
+    def add_keyframe(self, keyframe: Keyframe, frame: ev.FrameTracked, now_ns: int) -> None:
+        """Add a keyframe that is sent now, made of a frame."""
+        self.drift.add_keyframe(keyframe, frame.arrived_ns)
+        self.delay.add_keyframe(keyframe.id, frame.arrived_ns, now_ns)
+        self.local_cm = frame.error_cm
 
-        local_cm: as in `DriftEstimator.expected_cm`. map_sigma_cm: as in `MapFrame.sigma_cm`."""
-        error_cm = self.drift.expected_cm(local_cm, now_ns)
-        if error_cm is not None:
-            error_cm = min(math.hypot(error_cm, map_sigma_cm), m.MAX_ERROR_CM)
-        return m.Evaluation(keyframe, min(rtt_ms + (self._processing_ms or 0.0), m.MAX_DELAY_MS), error_cm)
+    def evaluation(
+        self, keyframe: int, rtt_ms: float | None, localisation: MapLocalisation, now_ns: int
+    ) -> m.Evaluation | None:
+        """Return the evaluation to send with `keyframe`, or between two if -1, within the bounds of the wire;
+        None before the first keyframe and round trip."""
+        if rtt_ms is None or (delay_ms := self.delay.ms(now_ns)) is None:
+            return None
+        T_odom_body = localisation.T_odom_body
+        map_sigma_cm = 0.0 if T_odom_body is None else localisation.map_frame.sigma_cm(T_odom_body)
+        drift_cm, error_cm = self.drift.expected_cm(self.local_cm, now_ns), None
+        if drift_cm is not None:
+            error_cm = min(math.hypot(drift_cm, map_sigma_cm), m.MAX_ERROR_CM)
+        return m.Evaluation(
+            keyframe,
+            min(delay_ms, m.MAX_DELAY_MS),
+            error_cm,
+            track_ms=min(self._processing_ms or 0.0, m.MAX_DELAY_MS),
+            rtt_ms=min(rtt_ms, m.MAX_DELAY_MS),
+            ack_ms=min(self.delay.ack_ms(now_ns), m.MAX_DELAY_MS),
+            drift_cm=min(drift_cm or 0.0, m.MAX_ERROR_CM),
+        )
 
 
 _MAX_MOTIONS = 100  # keyframes since the last answered one; the motion of older ones is merged

@@ -13,7 +13,9 @@ from share.geometry import se3
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredMap, map_poses
+from share.protocol.correction_delay import ComputationDelay
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
+from share.scheduling.room_budget import Grant
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import TrackState
 from share.wire.messages import Hello, Status, peer_id
@@ -127,6 +129,8 @@ class Peer(Sender):
     is_welcomed: bool = True  # in this session of the edge
     has_sent: bool = True  # a message in this session
     pending_saves: int = 0
+    grant: Grant | None = None  # the last that was sent
+    computation: ComputationDelay = field(default_factory=ComputationDelay)
     credential: str | None = ""
 
     @property

@@ -68,7 +68,7 @@ class EdgeVersionProbe:
 
         Raises WireError if it is no pong of an older version.
         """
-        if error.version not in _OLDER_VERSIONS:
+        if error.version not in _OLDER_VERSIONS or error.code != MESSAGE_CODES[Pong]:
             raise error
         pong = decode(frames, (error.version,))
         if not isinstance(pong, Pong):

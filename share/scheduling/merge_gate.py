@@ -168,13 +168,6 @@ def overlap_volumes(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64
     return out
 
 
-def ious(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64) -> F64:
-    """Return V_overlap / V_union (N,), 0 to 1; parameters as in `overlap_volumes`."""
-    overlap = overlap_volumes(a, T_w_a, b, T_w_b)
-    iou: F64 = overlap / (a.frustum.volume + b.frustum.volume - overlap)
-    return iou
-
-
 def _sample_points(frustum: Frustum, interval_m: float) -> F64:
     """Return homogeneous points (4, M), M > 0. The interval is clipped, so that M is bounded whatever an
     agent's calibration is."""

@@ -14,15 +14,15 @@ a persistent error drives the rate to a bound.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from share.config import ControlConfig
-from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe, qoe_factors
-from share.timing import RingBuffer
+from share.scheduling.base_delay import BaseDelay
+from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
+from share.scheduling.room_budget import Grant, Room, scarce_grant
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -63,59 +63,53 @@ def _clip(value: float, low: float, high: float) -> float:
     return min(high, max(low, value))
 
 
-_MINUTE_NS = 60_000_000_000
-_BASE_DELAY_MINUTES = 10  # after a change to a slower network the old minimum expires
+_FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 
 
 @dataclass(frozen=True)
-class BaseDelay:
-    """Base delay of one agent: the minimum of the last minutes, which does not depend on what it sends.
+class AgentReport:
+    """An evaluation as it arrives at the edge. now_ns: by the edge's clock. keyframes, poses: of this agent,
+    that have arrived so far."""
 
-    minima: ms by minute. Source: LEDBAT (RFC 6817, 3.4.2 and 4.2), which attributes delay above it to
-    queues."""
-
-    minima: Mapping[int, float] = field(default_factory=dict)
-
-    @property
-    def ms(self) -> float:
-        """The base delay, ms; inf before the first delay."""
-        return min(self.minima.values(), default=math.inf)
-
-    def with_delay(self, delay_ms: float, now_ns: int) -> BaseDelay:
-        """Return the base delay with one more measurement, at `now_ns`."""
-        minute = now_ns // _MINUTE_NS
-        minima = {old: ms for old, ms in self.minima.items() if minute - old < _BASE_DELAY_MINUTES}
-        minima[minute] = min(delay_ms, minima.get(minute, math.inf))
-        return BaseDelay(minima)
-
-
-_FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
+    kind: AgentKind
+    evaluation: Evaluation
+    now_ns: int
+    keyframes: int = 0
+    poses: int = 0
 
 
 class Policy:
     """Sets the keyframe rate of each agent of one edge, one evaluation at a time.
 
     has_merge_gate: merges with a small gain are skipped (`share.scheduling.merge_gate`). treats_alike:
-    headsets have no priority over robots. limits_rate: no rate exceeds `rate_max_hz`. streams_frames: agents
-    send raw frames, the edge tracks each alone, nothing is shared.
+    headsets have no priority over robots. limits_rate: no rate exceeds `rate_max_hz`. is_windowed: agents
+    send no keyframe while too many are not acknowledged. streams_frames: agents send raw frames, the edge
+    tracks each alone, nothing is shared.
     """
 
     has_merge_gate: ClassVar[bool] = False
     treats_alike: ClassVar[bool] = True
     limits_rate: ClassVar[bool] = True
+    is_windowed: ClassVar[bool] = False
     streams_frames: ClassVar[bool] = False
 
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
 
+    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+        """Return what an agent that joins may send until its first evaluation; None: everything."""
+        return None
+
+    def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
+        """Return what the agent may send from now on; None: everything."""
+        told = report.evaluation
+        hz = self.rate(agent, report.kind, told.delay_ms, told.error_cm, report.now_ns)
+        return None if hz is None else Grant(hz)
+
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
     ) -> float | None:
-        """Return the rate in Hz at which `agent` may send keyframes; None: no limit, as before its first
-        evaluation.
-
-        delay_ms, error_cm: as in `qoe`. now_ns: arrival of the evaluation, by the edge's clock.
-        """
+        """Return the rate in Hz by the agent's own delay and error alone, as in `qoe`; None: no limit."""
         return None
 
     def forget(self, agent: str) -> None:
@@ -126,6 +120,24 @@ class CovinsGPolicy(Policy):
     """Every keyframe is sent, every verified loop is merged."""
 
     limits_rate = False
+
+
+class FixedPolicy(Policy):
+    """Every agent has `fixed_rate_hz`, at most `rate_max_hz`."""
+
+    has_merge_gate = True
+
+    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+        return Grant(self._hz)
+
+    def rate(
+        self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
+    ) -> float | None:
+        return self._hz
+
+    @property
+    def _hz(self) -> float:
+        return min(self._config.fixed_rate_hz, self._config.rate_max_hz)
 
 
 class StreamedPolicy(Policy):
@@ -150,23 +162,36 @@ class LinearPolicy(Policy):
 
 
 class SharePolicy(Policy):
-    """A PID controller per agent drives its QoE to its target.
+    """A PID controller per agent drives its QoE to its target, within the room's budget.
 
     With `attribution`, a QoE that is low because of delay lowers the rate, since more keyframes would add to
-    the delay. Of the base delay, which no rate avoids, at most 20 ms count.
+    the delay. Of the base delay, which no rate avoids, at most 20 ms count: the target is what of it can be
+    reached.
     """
 
     has_merge_gate = True
     treats_alike = False
+    is_windowed = True
 
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(config)
         self._states: dict[str, PidState] = {}
         self._base_delays: dict[str, BaseDelay] = {}
+        self._room = Room()
+
+    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+        """Slow start: the least rate, until the room knows how the agent is served."""
+        return scarce_grant(self._qoe_parameters(agent, kind).form)
+
+    def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
+        told = report.evaluation
+        hz = self.rate(agent, report.kind, told.delay_ms, told.error_cm, report.now_ns)
+        terms = self._qoe_parameters(agent, report.kind)
+        return self._room.grant(agent, terms, hz, told, (report.keyframes, report.poses), report.now_ns)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
-    ) -> float | None:
+    ) -> float:
         if self._config.attribution:
             delay_ms = self._avoidable_delay_ms(agent, delay_ms, now_ns)
         parameters = self._qoe_parameters(agent, kind)
@@ -181,6 +206,7 @@ class SharePolicy(Policy):
     def forget(self, agent: str) -> None:
         self._states.pop(agent, None)
         self._base_delays.pop(agent, None)
+        self._room.forget(agent)
 
     def _avoidable_delay_ms(self, agent: str, delay_ms: float, now_ns: int) -> float:
         """Return the delay without the part of the base delay above 20 ms."""
@@ -190,6 +216,25 @@ class SharePolicy(Policy):
 
     def _qoe_parameters(self, agent: str, kind: AgentKind) -> QoeParameters:
         return QoeParameters.from_config(self._config, kind, agent)
+
+
+class SharePaperPolicy(SharePolicy):
+    """The paper's algorithm to the letter: one step a keyframe, by round trip plus processing time; a low
+    QoE raises the rate, whatever the reason, and there is no window and no budget."""
+
+    is_windowed = False
+
+    def __init__(self, config: ControlConfig) -> None:
+        super().__init__(replace(config, attribution=False))
+
+    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+        return None
+
+    def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
+        told = report.evaluation
+        if told.keyframe < 0:
+            return Grant(self._states[agent].rate_hz) if agent in self._states else None
+        return Grant(self.rate(agent, report.kind, told.rtt_ms + told.track_ms, told.error_cm, report.now_ns))
 
 
 class EqualPolicy(SharePolicy):
@@ -212,66 +257,11 @@ class RandomPolicy(SharePolicy):
 
 POLICIES: dict[str, type[Policy]] = {
     "share": SharePolicy,
+    "share-paper": SharePaperPolicy,
     "covins-g": CovinsGPolicy,
     "linear": LinearPolicy,
     "equal": EqualPolicy,
     "random": RandomPolicy,
+    "fixed": FixedPolicy,
     "streamed": StreamedPolicy,
 }
-
-
-_MAX_SERIES = 5000  # newest evaluations of an agent in a report: an hour at more than one a second
-
-
-class RatedEvaluation(NamedTuple):
-    """An evaluation, its QoE, and the rate set by it; None: no limit."""
-
-    t_s: float | None
-    delay_ms: float | None
-    error_cm: float | None
-    qoe: float | None
-    rate_hz: float | None
-
-
-class RateScheduler:
-    """A policy and the history of its decisions, for one edge. Agents go by name; a new run starts anew."""
-
-    def __init__(self, config: ControlConfig, policy: str) -> None:
-        self._config, self._policy = config, POLICIES[policy](config)
-        self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
-        self._history: dict[str, RingBuffer] = {}  # of all runs of a name
-        self._latest: dict[str, RatedEvaluation] = {}  # of the present run
-
-    def begin_run(self, agent: str) -> None:
-        """Start a new run of an agent, without a limit until its first evaluation."""
-        self._policy.forget(agent)
-        self._latest.pop(agent, None)
-
-    def forget(self, agent: str) -> None:
-        """Drop all state and history of a name."""
-        self.begin_run(agent)
-        self._history.pop(agent, None)
-
-    def evaluate(
-        self, agent: str, kind: AgentKind, evaluation: Evaluation, now_ns: int, t_s: float
-    ) -> float | None:
-        """Return the rate to send to the agent, Hz; None: no limit. t_s: time for the report."""
-        rate_hz = self._policy.rate(agent, kind, evaluation.delay_ms, evaluation.error_cm, now_ns)
-        delay_ms, error_cm = evaluation.delay_ms, evaluation.error_cm
-        value = qoe(delay_ms, error_cm, QoeParameters.from_config(self._config, kind, agent))
-        rated = RatedEvaluation(
-            *(None if x is None else round(x, 4) for x in (t_s, delay_ms, error_cm, value, rate_hz))
-        )
-        self._history.setdefault(agent, RingBuffer(len(rated), _MAX_SERIES)).add(rated)
-        self._latest[agent] = rated
-        return rate_hz
-
-    def report(self, agent: str | None) -> dict[str, float | None]:
-        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run; None: no run."""
-        rated = None if agent is None else self._latest.get(agent)
-        return {name: None if rated is None else getattr(rated, name) for name in ("rate_hz", "qoe")}
-
-    def series(self, agent: str) -> dict[str, list[float | None]]:
-        """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""
-        rated = self._history.get(agent, RingBuffer(len(RatedEvaluation._fields), 0))
-        return {name: rated.column(k) for k, name in enumerate(RatedEvaluation._fields)}

@@ -48,7 +48,7 @@ from share.types import (
 )
 from share.wire import messages as m
 
-WIRE_VERSION = 6
+WIRE_VERSION = 7
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 16
@@ -274,7 +274,17 @@ _LAYOUTS: dict[type, _Layout] = {
         _Array("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_SPANS, key="earlier_cov"),
         **_KEYFRAME_SCALARS,
     ),
-    m.Evaluation: _Layout(4, m.Evaluation, keyframe=Int64, delay_ms=float, error_cm=float | None),
+    m.Evaluation: _Layout(
+        4,
+        m.Evaluation,
+        keyframe=Int64,
+        delay_ms=float,
+        error_cm=float | None,
+        track_ms=float,
+        rtt_ms=float,
+        ack_ms=float,
+        drift_cm=float,
+    ),
     m.Ping: _Layout(5, m.Ping, sequence=Int64, sent_ns=Int64),
     m.Bye: _Layout(6, m.Bye),
     Frame: _Layout(
@@ -304,7 +314,7 @@ _LAYOUTS: dict[type, _Layout] = {
         segment_keyframe=Int64,
         answered_keyframe=Int64,
     ),
-    m.Rate: _Layout(20, m.Rate, hz=float),
+    m.Rate: _Layout(20, m.Rate, hz=float, is_windowed=bool, pose_hz=float | None),
     m.Pong: _Layout(
         21, m.Pong, sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64
     ),

@@ -15,6 +15,7 @@ from share.geometry.camera import Camera, Rig
 from share.types import F64, AgentKind, Correction, Frame, Keyframe, TrackState, WaitReason
 
 MAX_RATE_HZ = 1000.0
+MIN_POSE_HZ = 1.0
 MAX_BUFFERED = 256  # ids in one Ack: keyframes buffered at the edge
 MAX_TEXT_LENGTH = 512  # characters of a text for a person
 MAX_REASON_LENGTH = 120  # characters of `Status.reason`
@@ -84,19 +85,31 @@ class PoseUpdate:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Sent per keyframe: the delay that the agent measures (round trip + processing) and its expected error;
-    None: unknown."""
+    """Sent with each keyframe, and twice a second between them: how the agent is served.
+
+    keyframe: which it goes with, -1 between them. delay_ms: from a frame to the correction that answers it,
+    filtered. error_cm: expected error; None: unknown. track_ms: from a frame's arrival until its keyframe is
+    made, filtered. rtt_ms: round trip of a small message, filtered. ack_ms: from sending a keyframe until it
+    was acknowledged, the newest, or how long the oldest has been waiting, if longer. drift_cm: part of the
+    error that grows between keyframes; 0: unknown."""
 
     keyframe: int
     delay_ms: float
     error_cm: float | None
+    track_ms: float = 0.0
+    rtt_ms: float = 0.0
+    ack_ms: float = 0.0
+    drift_cm: float = 0.0
 
     def __post_init__(self) -> None:
-        checked_id("keyframe", self.keyframe)
-        if not 0 <= self.delay_ms <= MAX_DELAY_MS:
-            raise ValueError(f"delay_ms: {self.delay_ms} is outside 0 .. {MAX_DELAY_MS:g}")
+        checked_id("keyframe", self.keyframe, minimum=-1)
+        for name in ("delay_ms", "track_ms", "rtt_ms", "ack_ms"):
+            if not 0 <= (value := getattr(self, name)) <= MAX_DELAY_MS:
+                raise ValueError(f"{name}: {value} is outside 0 .. {MAX_DELAY_MS:g}")
         if self.error_cm is not None and not 0 <= self.error_cm <= MAX_ERROR_CM:
             raise ValueError(f"error_cm: {self.error_cm} is outside 0 .. {MAX_ERROR_CM:g}")
+        if not 0 <= self.drift_cm <= MAX_ERROR_CM:
+            raise ValueError(f"drift_cm: {self.drift_cm} is outside 0 .. {MAX_ERROR_CM:g}")
 
 
 @dataclass(frozen=True)
@@ -174,13 +187,18 @@ class Ack:
 
 @dataclass(frozen=True)
 class Rate:
-    """Keyframes a second that the agent may send."""
+    """Keyframes a second that the agent may send. is_windowed: and only while those that are not
+    acknowledged are few (`share.scheduling.keyframe_window`). pose_hz: poses a second; None: every one."""
 
     hz: float
+    is_windowed: bool = False
+    pose_hz: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.hz <= MAX_RATE_HZ:
             raise ValueError(f"rate: {self.hz} Hz is outside 0 .. {MAX_RATE_HZ:g}")
+        if self.pose_hz is not None and not MIN_POSE_HZ <= self.pose_hz <= MAX_RATE_HZ:
+            raise ValueError(f"pose_hz: {self.pose_hz} is outside {MIN_POSE_HZ:g} .. {MAX_RATE_HZ:g}")
 
 
 @dataclass(frozen=True)

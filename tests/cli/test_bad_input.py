@@ -769,7 +769,21 @@ def test_agent_without_a_kind_is_refused(share, more):
 def test_unknown_network_is_refused(command: tuple[str, ...]) -> None:
     done = subprocess.run([*SHARE, *command, "--link", "nowhere"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "share: --link: 'nowhere' is neither a file nor one of wifi5, wifi-busy\n"
+    names = "wifi5, wifi-busy, shared-150, shared-15, shared-8, shared-5"
+    assert done.stderr == f"share: --link: 'nowhere' is neither a file nor one of {names}\n"
+
+
+def test_air_that_agents_share_is_refused_in_real_time() -> None:
+    agent = ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1")
+    for command in (("demo",), agent):
+        done = subprocess.run(
+            [*SHARE, *command, "--link", "shared-8"], capture_output=True, text=True, timeout=60
+        )
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.startswith(
+            "share: --link shared-8: air that agents share is emulated in virtual time"
+        )
+        assert done.stderr.count("\n") == 1
 
 
 def test_invalid_frustum_is_refused_before_the_edge_starts(tmp_path: Path) -> None:

@@ -102,6 +102,7 @@ def test_wrong_use_is_refused_before_anything_is_played(evaluate, plain_session,
     for arguments, what in (
         (("run", plain_session, "--link", "wifi6", "--out", tmp_path / "r"), "wifi6"),
         (("run", plain_session, "--link", "bob=wifi5", "--out", tmp_path / "r"), "are ar1, ar2, robot"),
+        (("run", plain_session, "--link", "shared-8", "--out", tmp_path / "r"), "in virtual time only"),
         (("run", tmp_path, "--out", tmp_path / "r"), "has no session.yaml; give a session"),
         (("run", tmp_path / "nosuch", "--out", tmp_path / "r"), "there is no such folder; give a session"),
         (("score", tmp_path), "has no run.json"),

@@ -165,7 +165,7 @@ messages = st.one_of(
     st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, rigs(), st.booleans()),
     st.builds(m.PoseUpdate, stamps, st.sampled_from(TrackState), ids_or_none, poses()),
     keyframes(),
-    st.builds(m.Evaluation, ids, late, st.none() | late),
+    st.builds(m.Evaluation, ids_or_none, late, st.none() | late, late, late, late, late),
     st.builds(
         m.Status,
         st.sampled_from(TrackState),
@@ -178,7 +178,12 @@ messages = st.one_of(
     st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT_LENGTH)),
     st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_BUFFERED).map(tuple)),
     st.builds(Correction, poses(), covs, words, ids, ids, ids_or_none),
-    st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
+    st.builds(
+        m.Rate,
+        st.floats(0, m.MAX_RATE_HZ),
+        st.booleans(),
+        st.none() | st.floats(m.MIN_POSE_HZ, m.MAX_RATE_HZ),
+    ),
     st.builds(m.Pong, int64, stamps, stamps, stamps, int64),
     frames(),
     tracked(),

@@ -193,7 +193,7 @@ def test_no_latency_depends_on_the_clock_offset(edge_ns: Callable[[int], int]) -
     true, _ = latencies(lambda ns: ns)
     told, _ = latencies(edge_ns)
     assert told == pytest.approx(true, abs=1e-3)
-    assert {round(x) for x in true} == {4, 7, 27}  # to the pose; with a round trip of 3; to the correction
+    assert {round(x) for x in true} == {4, 27}  # to the pose; to the correction
 
 
 def test_the_clock_offset_is_reported_if_the_setting_allows_its_uncertainty() -> None:
@@ -284,7 +284,7 @@ def test_keyframes_are_numbered_sent_and_evaluated() -> None:
     effects = handle(agent, tracked(11, pose(1), candidate=True, ms=5), 560 * MS)
     [keyframe] = only(Keyframe, effects, messages=True)
     assert (keyframe.id, keyframe.reference, keyframe.stamp_ns) == (0, -1, 10**15 + 550 * MS)
-    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 13.0, 0.0)]
+    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 10.0, 0.0, 10.0, 3.0)]
     assert only(ev.FrameDone, effects)[0].is_sent
 
 
@@ -424,7 +424,8 @@ def test_a_late_correction_of_an_earlier_segment_is_ignored() -> None:
     assert in_force(agent, 250 * MS) is None
 
 
-def test_the_reported_delay_is_smoothed_and_includes_the_keyframe() -> None:
+def test_round_trip_and_time_to_the_keyframe_are_reported_smoothed() -> None:
+    """Their sum is the delay of the paper."""
     agent = welcomed()
     [ping] = [
         p for t in (1, 500) for p in only(m.Ping, handle(agent, ev.AgentTick(), t * MS), messages=True)
@@ -434,7 +435,7 @@ def test_the_reported_delay_is_smoothed_and_includes_the_keyframe() -> None:
     for k, took_ms in enumerate((11, 11, 91, 11), 20):
         handle(agent, tracked(k, pose(k), candidate=False), k * 50 * MS + 5 * MS)
         effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS + took_ms * MS)
-        delays += [told.delay_ms for told in only(m.Evaluation, effects, messages=True)]
+        delays += [told.rtt_ms + told.track_ms for told in only(m.Evaluation, effects, messages=True)]
     assert delays == pytest.approx([17.0, 17.0, 27.0, 25.75])
 
 

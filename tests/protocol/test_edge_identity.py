@@ -57,7 +57,7 @@ def test_a_key_is_authorised_for_its_names_only() -> None:
     assert isinstance(refused, m.Refused)
     assert "authorized for 'eve', 'mallory', not for 'ann'" in refused.reason
     assert "share keys authorize" in refused.reason
-    (welcome,) = sent(tell(edge, hello_of("eve", SECRET), EVE))
+    welcome, _ = sent(tell(edge, hello_of("eve", SECRET), EVE))
     assert isinstance(welcome, m.Welcome)
 
 
@@ -78,7 +78,7 @@ def test_without_keys_the_run_id_identifies_a_run() -> None:
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     assert of(tell(edge, keyframe(0), None), ed.AddKeyframe)
-    (welcome,) = sent(tell(edge, hello_of("ann", SECRET), None, now_ns=10**9))  # connected again
+    welcome, _ = sent(tell(edge, hello_of("ann", SECRET), None, now_ns=10**9))  # connected again
     assert welcome == m.Welcome(7, 1)
     (refused,) = sent(tell(edge, hello_of("ann", 5), None, peer=5, now_ns=10**9))
     assert isinstance(refused, m.Refused)

@@ -82,7 +82,7 @@ def test_a_restored_run_continues() -> None:
     foot = OdometryBase(4, 800 * MS, at(0.8))
     edge = Edge(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot)])
     effects = tell(edge, HELLO)
-    (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.SendToPeer)]
+    welcome, _ = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.SendToPeer)]
     assert welcome == m.Welcome(8, 5)
     assert not of(effects, ed.SaveChanges)
     assert not of(effects, ed.AddRun)  # the mapper has the run from the store

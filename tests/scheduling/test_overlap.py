@@ -12,7 +12,7 @@ from share.errors import ConfigError
 from share.geometry.camera import Camera
 from share.geometry.se3 import exp, transform
 from share.plain_data import from_mapping
-from share.scheduling.merge_gate import Frustum, SampledFrustum, ious, overlap_volumes
+from share.scheduling.merge_gate import Frustum, SampledFrustum, overlap_volumes
 from share.types import F64
 
 WIDE = Frustum(math.radians(87), math.radians(58), 0.3, 5.0)
@@ -30,6 +30,12 @@ def poses(seed: int, count: int, metres: float = 3.0) -> F64:
 
 def shifted(x: float = 0, y: float = 0, z: float = 0) -> F64:
     return exp(np.array([0, 0, 0, x, y, z], dtype=float))
+
+
+def ious(a: SampledFrustum, T_w_a: F64, b: SampledFrustum, T_w_b: F64) -> F64:
+    """V_overlap / V_union (N,), 0 to 1."""
+    overlap = overlap_volumes(a, T_w_a, b, T_w_b)
+    return np.asarray(overlap / (a.frustum.volume + b.frustum.volume - overlap))
 
 
 def test_frustum_from_a_calibration() -> None:

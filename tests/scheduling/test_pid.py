@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from share.config import ControlConfig
-from share.scheduling.policies import GAP_S, BaseDelay, PidState, pid_step
+from share.scheduling.base_delay import BaseDelay
+from share.scheduling.policies import GAP_S, PidState, pid_step
 
 GAINS = ControlConfig(kp=0.8, ki=0.15, kd=0.2, rate_min_hz=0.5, rate_max_hz=10)
 MINUTE = 60_000_000_000

@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 
 from share import config as settings
 from share.config import ControlConfig
-from share.scheduling.policies import POLICIES, Policy
+from share.scheduling.policies import POLICIES, AgentReport, PidState, Policy, pid_step
+from share.scheduling.qoe import QoeParameters, qoe
+from share.scheduling.room_budget import Grant, scarce_grant
 from share.types import AgentKind
+from share.wire.messages import Evaluation
 
 S = 1_000_000_000
 CONFIG = ControlConfig(  # wide bounds; a headset is content with 0.5 cm
@@ -49,10 +52,12 @@ def test_every_configurable_policy_exists() -> None:
     ("name", "gated", "alike", "raw"),
     [
         ("share", True, False, False),
+        ("share-paper", True, False, False),
         ("covins-g", False, True, False),
         ("linear", True, True, False),
         ("equal", True, True, False),
         ("random", True, False, False),
+        ("fixed", True, True, False),
         ("streamed", False, True, True),
     ],
 )
@@ -113,7 +118,7 @@ def test_agents_are_independent_and_can_be_forgotten() -> None:
 
 
 @given(
-    st.sampled_from(["share", "linear", "equal", "random"]),
+    st.sampled_from(["share", "share-paper", "linear", "equal", "random", "fixed"]),
     st.lists(
         st.tuples(
             st.sampled_from(["ann", "bob"]),
@@ -182,3 +187,44 @@ def test_by_attribution_the_base_delay_does_not_lower_the_rate() -> None:
         assert last([(delay_ms, 2.0)] * 60) == CONFIG.rate_max_hz
     waits = [(30.0, 0.6)] * 60 + [(90.0, 0.6)] * 40
     assert last(waits[:60]) == CONFIG.rate_max_hz and last(waits) == CONFIG.rate_min_hz
+
+
+def report(kind: AgentKind, now_s: float, evaluation: Evaluation, keyframes: int = 9) -> AgentReport:
+    return AgentReport(kind, evaluation, round(now_s * S), keyframes, poses=round(30 * now_s))
+
+
+def test_share_paper_steps_once_a_keyframe_by_round_trip_and_processing() -> None:
+    """To the digit that of the equations without attribution, whatever the delay until corrections."""
+    paper, states = made("share-paper", replace(CONFIG, attribution=True)), PidState(CONFIG.rate_max_hz)
+    for k in range(1, 30):
+        delay_ms, error_cm = 20.0 + k, 0.2 + 0.1 * k
+        told = Evaluation(k, 9e3, error_cm, track_ms=12.0, rtt_ms=delay_ms - 12.0, ack_ms=5e3)
+        quality = qoe(delay_ms, error_cm, QoeParameters.from_config(CONFIG, AgentKind.AR))
+        states = pid_step(states, CONFIG.ar_target - quality, round(0.7 * k * S), CONFIG)
+        assert paper.evaluate("ann", report(AgentKind.AR, 0.7 * k, told)) == Grant(states.rate_hz)
+        between = replace(told, keyframe=-1)
+        assert paper.evaluate("ann", report(AgentKind.AR, 0.7 * k + 0.3, between)) == Grant(states.rate_hz)
+    assert paper.first_grant("ann", AgentKind.AR) is None and not paper.is_windowed
+
+
+def test_fixed_is_one_rate_for_all_from_the_first_keyframe_on() -> None:
+    fixed = made("fixed", replace(CONFIG, fixed_rate_hz=0.7))
+    for kind in AgentKind:
+        assert fixed.first_grant("ann", kind) == Grant(0.7)
+        for delay_ms in (10.0, 9e3):
+            told = Evaluation(0, delay_ms, 3.0)
+            assert fixed.evaluate("ann", report(kind, 1.0, told)) == Grant(0.7)
+    capped = made("fixed", replace(CONFIG, fixed_rate_hz=99.0))
+    assert capped.first_grant("ann", AgentKind.AR) == Grant(CONFIG.rate_max_hz)
+
+
+def test_share_begins_with_the_least_rate_and_yields_where_keyframes_take_long() -> None:
+    share, least = made("share", ControlConfig()), scarce_grant(AgentKind.AR)
+    assert share.is_windowed and share.first_grant("ann", AgentKind.AR) == least
+    assert share.first_grant("bob", AgentKind.ROBOT) == scarce_grant(AgentKind.ROBOT)
+    slow = Evaluation(0, 400.0, 1.0, track_ms=10.0, rtt_ms=10.0, ack_ms=310.0)
+    quick = Evaluation(0, 45.0, 1.0, track_ms=10.0, rtt_ms=5.0, ack_ms=8.0)
+    assert share.evaluate("ann", report(AgentKind.AR, 1.0, slow)) == least
+    for k in range(2, 12):
+        grant = share.evaluate("ann", report(AgentKind.AR, float(k), quick, keyframes=9 + k))
+    assert grant is not None and grant.pose_hz is None and grant.hz >= ControlConfig().rate_min_hz

@@ -14,7 +14,8 @@ from helpers.room_simulation import MS, tracked_frames
 from share.config import NEAR_M, Config, EdgeConfig
 from share.geometry import se3
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
-from share.lab.evaluate.simulation import ProcessingDelays, Simulation
+from share.lab.evaluate.processing_delays import ProcessingDelays
+from share.lab.evaluate.simulation import Simulation
 from share.protocol.agent_events import LocalisedPose
 from share.types import F64
 

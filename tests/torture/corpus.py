@@ -101,7 +101,7 @@ def _made_up(version: int) -> dict[str, Message]:
     arrays = [image, ["|u1", [0]], ["<f4", [0]], ["<i8", [1]], ["<f8", [1, 3]], ["<f8", [1, 3]]]
     return {
         "bye": [pack([version, 6, [], []])],
-        "evaluation": [pack([version, 4, [0, 50.0, 3.0], []])],
+        "evaluation": [pack([version, 4, [0, 50.0, 3.0, 9.0, 5.0, 8.0, 0.3], []])],
         "frame": [
             pack([version, 7, [10, 0, 0], arrays]),
             bytes(64),
@@ -112,7 +112,7 @@ def _made_up(version: int) -> dict[str, Message]:
             bytes(24),
         ],
         "refused": [pack([version, 17, ["no"], []])],
-        "rate": [pack([version, 20, [3.0], []])],
+        "rate": [pack([version, 20, [3.0, True, None], []])],
         "tracked": [pack([version, 22, [0, 10, "OK", False, False, True, None], pose]), eye],
         "correction": [
             pack([version, 19, ["ann-1234/0", 1, 0, 0], [*pose, ["<f8", [6, 6]]]]),

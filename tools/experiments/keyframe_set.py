@@ -26,13 +26,14 @@ from share.files.writing import atomic_write, writable_dir
 from share.lab.emulate.recipe import Progress, SessionRecipe, no_progress
 from share.lab.emulate.session import default_cache
 from share.types import F64, Keyframe
-from share.wire.codec import decode, encode
+from share.wire.codec import WIRE_VERSION, decode, encode
 from share.wire.messages import Hello, Message
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 
 # increase it when any keyframe changes (image, depth, odometry); the recipe has the emulator's version
 VERSION = 4
+_READABLE = (6, WIRE_VERSION)  # wire versions with these keyframes
 
 
 def place(recipe: SessionRecipe, every: Spacing, cache: Path | None = None) -> Path:
@@ -141,8 +142,8 @@ def _packed(agent: AgentKeyframes) -> _Agent:
 
 def _unpacked(agent: _Agent) -> AgentKeyframes:
     return AgentKeyframes(
-        cast(Hello, decode(agent.hello)),
-        tuple(cast(Keyframe, decode(frames)) for frames in agent.keyframes),
+        cast(Hello, decode(agent.hello, _READABLE)),
+        tuple(cast(Keyframe, decode(frames, _READABLE)) for frames in agent.keyframes),
         _poses(agent.T_world_body),
         _poses(agent.T_odom_body),
     )

@@ -38,7 +38,8 @@ from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.se3 import umeyama  # noqa: E402
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS  # noqa: E402
-from share.lab.evaluate.simulation import ProcessingDelays, Simulation, TrackedFrame  # noqa: E402
+from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
+from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
 from share.mapping.mapper import Mapper  # noqa: E402
 from share.types import F64, KeyframeCandidate, View  # noqa: E402
 from share.wire.messages import Hello, peer_id  # noqa: E402

@@ -35,7 +35,8 @@ from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.interpolation import associate, interpolate  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.simulation import ProcessingDelays, Simulation  # noqa: E402
+from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
+from share.lab.evaluate.simulation import Simulation  # noqa: E402
 from share.lab.evaluate.virtual_time import track_session  # noqa: E402
 from share.mapping.map_changes import StoredMap, map_poses  # noqa: E402
 from share.protocol.agent_events import LocalisedPose  # noqa: E402

@@ -38,7 +38,8 @@ from share.config import NEAR_M, POLICY_NAMES, STREAMED, Config  # noqa: E402
 from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.geometry.se3 import transform, umeyama  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.simulation import ProcessingDelays, Simulation, TrackedFrame  # noqa: E402
+from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
+from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
 from share.metrics.frame_log import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
 from share.protocol.agent_events import LocalisedPose  # noqa: E402
@@ -99,7 +100,7 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         known = truth_of(made, NEAR_M, config.control.far_m)
         mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     links = LinkAssignment.parse(link)
-    links.check(made.agents)
+    links.check(made.agents, virtual=True)
     networks = [links.network_for(agent.hello.name) for agent in who]
     members = list(zip((a.hello for a in who), seen, networks, strict=True))
     world = Simulation(config, members, ProcessingDelays(), seed, mapper)

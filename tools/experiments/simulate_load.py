@@ -34,7 +34,8 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import POLICY_NAMES, STREAMED, Config  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.simulation import ProcessingDelays, Simulation  # noqa: E402
+from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
+from share.lab.evaluate.simulation import Simulation  # noqa: E402
 from share.mapping.corrections import MapEvent  # noqa: E402
 from share.metrics.frame_log import summary  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402

@@ -12,7 +12,7 @@ from typing import Any
 
 from share.errors import UsageError
 from share.files.reading import MAX_TABLE_BYTES, read_bytes
-from share.lab.emulate.motion.spec import RecordedSpec, parse_motion
+from share.lab.emulate.motion.spec import PAPER_S, RecordedSpec, parse_motion
 from share.lab.emulate.sensor.effects import Effects
 
 # increase it when any picture, motion or file changes, so that cached sessions are made again
@@ -70,6 +70,8 @@ class SessionRecipe:
         out["size"] = None if self.size is None else list(self.size)
         if not self.day:
             del out["day"]  # sessions that were made before there were days keep their digest
+        if self.seconds < PAPER_S and any(text.startswith("paper:") for text in self.motions):
+            out["is_cut"] = True  # before, such a session had all of an experiment of the paper
         return out
 
     @property

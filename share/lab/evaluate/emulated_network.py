@@ -5,7 +5,9 @@ take time on the air, arrive in order and are never lost; a lost packet is resen
 come in bursts (Gilbert, Bell System Technical Journal 1960). Resends follow after two round trips and then
 after doubling timeouts: RFC 8985 (tail loss probe), RFC 6298.
 
-`LinkAssignment` parses `--link`, which network each agent of a session goes through.
+In virtual time, agents may share the air of an access point (`share.lab.evaluate.shared_air`); the channels
+then add delay and jitter. `LinkAssignment` parses `--link`, which network each agent of a session goes
+through.
 """
 
 from __future__ import annotations
@@ -21,12 +23,11 @@ import numpy as np
 
 from share.errors import UsageError
 from share.files.yaml_file import read_yaml
+from share.lab.evaluate.shared_air import HEADER_BYTES, PACKET_BYTES, AirModel
 from share.net.transport import LINGER_MS, QUEUE_MESSAGES, AgentLink
 from share.plain_data import from_mapping
 from share.wire.codec import Bytes, message_bytes
 
-_PACKET_BYTES = 1448  # payload of Ethernet's 1500
-_HEADER_BYTES = 66  # per packet: Ethernet, IP, TCP with time stamps
 _PROBE_MS = 10.0  # added to two round trips before the first resend
 _TIMEOUT_MS = 200.0  # before the second resend, doubled for each further one
 _NS_PER_MS = 1_000_000
@@ -50,15 +51,27 @@ class ChannelModel:
 
 @dataclass(frozen=True)
 class NetworkModel:
-    """Both directions between an agent and the edge."""
+    """Both directions between an agent and the edge. air: of an access point, shared by all agents with an
+    equal network, in virtual time only; up and down then have no rate of their own."""
 
     up: ChannelModel = field(default_factory=ChannelModel)
     down: ChannelModel = field(default_factory=ChannelModel)
+    air: AirModel | None = None
+
+    def __post_init__(self) -> None:
+        if self.air is not None and (self.up.mbps or self.down.mbps):
+            raise ValueError("give either air.mbps, shared by all, or up.mbps and down.mbps")
 
     @property
     def round_trip_ms(self) -> float:
         """Mean round trip of a small message."""
         return sum(model.delay_ms + model.jitter_ms for model in (self.up, self.down))
+
+
+def _shared(mbps: float) -> NetworkModel:
+    """Return a network over shared air; one transmission in a hundred fails."""
+    way = ChannelModel(0.0, 1.0, 0.7)
+    return NetworkModel(way, way, AirModel(mbps, 0.01))
 
 
 NETWORK_PRESETS = {
@@ -70,6 +83,11 @@ NETWORK_PRESETS = {
     "wifi-busy": NetworkModel(
         ChannelModel(15.0, 3.0, 8.0, 0.01, 4.0), ChannelModel(20.0, 3.0, 5.0, 0.01, 4.0)
     ),
+    # one access point for all agents, in virtual time: what a weak signal or busy neighbours leave of it
+    "shared-150": _shared(150.0),
+    "shared-15": _shared(15.0),
+    "shared-8": _shared(8.0),
+    "shared-5": _shared(5.0),
 }
 
 
@@ -85,8 +103,8 @@ class Channel:
     def arrival_ns(self, size: int, now_ns: int) -> int:
         """Return the arrival of a message of `size` bytes sent at `now_ns`, which must not decrease."""
         model = self._model
-        packets = max(1, math.ceil(size / _PACKET_BYTES))
-        on_air_ms = 8e-3 * (size + packets * _HEADER_BYTES) / model.mbps if model.mbps else 0.0
+        packets = max(1, math.ceil(size / PACKET_BYTES))
+        on_air_ms = 8e-3 * (size + packets * HEADER_BYTES) / model.mbps if model.mbps else 0.0
         self._air_free_ns = max(now_ns, self._air_free_ns) + round(on_air_ms * _NS_PER_MS)
         latency_ms = model.delay_ms + (self._rng.exponential(model.jitter_ms) if model.jitter_ms else 0.0)
         latency_ms += self._retransmit_ms(packets)
@@ -118,13 +136,22 @@ class Channel:
 
 def load_network(name: str) -> NetworkModel:
     """Return a preset by its name, or read a YAML file {up: {mbps, delay_ms, jitter_ms, loss, burst}, down:
-    {…}}. Raises UsageError, ConfigError."""
+    {…}, air: {mbps, loss}}. Raises UsageError, ConfigError."""
     if name in NETWORK_PRESETS:
         return NETWORK_PRESETS[name]
     path = Path(name)
     if not path.is_file():
         raise UsageError(f"--link: '{name}' is neither a file nor one of {', '.join(NETWORK_PRESETS)}")
     return from_mapping(NetworkModel, read_yaml(path).data, str(path))
+
+
+def check_air_is_own(name: str, network: NetworkModel) -> None:
+    """Raise UsageError where this network shares its air, which processes of their own cannot."""
+    if network.air is not None:
+        raise UsageError(
+            f"--link {name}: air that agents share is emulated in virtual time only: "
+            "share evaluate run --virtual"
+        )
 
 
 class EmulatedLink:
@@ -216,8 +243,11 @@ class LinkAssignment:
         per_agent = dict(pairs)
         return cls(per_agent.pop("", None), per_agent)
 
-    def check(self, agents: Collection[str]) -> None:
-        """Raises UsageError if a link is assigned to an unknown agent."""
+    def check(self, agents: Collection[str], virtual: bool = False) -> None:
+        """Raises UsageError if a link is assigned to an unknown agent, or shares its air in real time."""
+        if not virtual:
+            for name in filter(None, (self.default, *self.per_agent.values())):
+                check_air_is_own(name, load_network(name))
         if unknown := [name for name in self.per_agent if name not in agents]:
             raise UsageError(f"--link: there is no agent '{unknown[0]}'; the agents are {', '.join(agents)}")
 

@@ -207,9 +207,11 @@ def markdown(
         f"(n of N): only n of N pairs have both values. {_INTERVAL_NOTE}",
         pictures.comparison,
     ]
-    others = [name for name in names if name != names[0]]
-    if others:
-        parts += [f"## Errors with `{names[0]}`", *(_win_counts(runs, names[0], other) for other in others)]
+    rivals = [name for name in names if name != base]
+    if rivals:  # of the first, in whatever order they are named
+        subject = rivals[0]
+        others = [name for name in names if name != subject]
+        parts += [f"## Errors with `{subject}`", *(_win_counts(runs, subject, other) for other in others)]
     parts += ["## Every agent", pictures.agents, _agent_table(runs, names), pictures.timeline]
     return "\n\n".join(part for part in parts if part) + "\n"
 

@@ -8,7 +8,6 @@ Latencies are thus those of otherwise idle machines, and a run is deterministic 
 from __future__ import annotations
 
 import heapq
-import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,8 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
+from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.shared_air import SharedAir
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loops import KeyframeKey
@@ -42,65 +43,7 @@ from share.wire.messages import Hello, peer_id
 _MS = 1_000_000
 _TICK_MS = 50
 _RANDOM_BATCH = 1000
-
-
-@dataclass(frozen=True)
-class Delay:
-    """Lognormal delay, ms: half of all draws are below `p50`, 95 % below `p95`."""
-
-    p50: float
-    p95: float
-
-    def draw_ns(self, normal: float) -> int:
-        """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
-        sigma = math.log(max(1.0, self.p95 / self.p50)) / 1.645
-        return round(self.p50 * math.exp(sigma * normal) * _MS)
-
-
-@dataclass(frozen=True)
-class Sampled:
-    """Measured delay, ms: `ms` are quantiles at equal steps, from the minimum to the maximum."""
-
-    ms: tuple[float, ...]
-
-    def draw_ns(self, normal: float) -> int:
-        """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
-        below = 0.5 * (1 + math.erf(normal / math.sqrt(2)))
-        return round(float(np.interp(below * (len(self.ms) - 1), range(len(self.ms)), self.ms)) * _MS)
-
-
-# Keyframe work after a frame, ms; none after half of the frames. Measured on 1,301 frames of four recordings.
-_SLICES = Sampled((*[0.0] * 11, 0.45, 2.2, 2.7, 3.5, 4.0, 4.7, 5.3, 5.6, 5.9, 8.2))
-
-
-@dataclass(frozen=True)
-class ProcessingDelays:
-    """Delays of each processing step. Defaults: docs/lab/scheduling-figures.md.
-
-    Agent: `frame`: from a frame to its published pose; `keyframe`: from there until its keyframe may be sent;
-    `finish_keyframe`: slice of keyframe work that may follow any frame. Edge: `receive`: a message at the
-    front; the rest: steps of mapper and solver. Those of images (`describe`, `align_*`, `verify_images_*`)
-    were measured as CPU time in two emulated sessions of 640x480 px, 222 to 1,539 steps each; `index` for 16
-    random views of 800 features, with their insertion.
-    """
-
-    frame: Delay = Delay(4.3, 5.4)
-    keyframe: Delay = Delay(3.9, 4.7)
-    finish_keyframe: Delay | Sampled = _SLICES
-    receive: Delay = Delay(0.3, 1.0)
-    add: Delay = Delay(0.4, 0.8)
-    query: Delay = Delay(3.0, 5.0)
-    verify_accepted: Delay = Delay(4.0, 6.0)
-    verify_refused: Delay = Delay(2.0, 5.0)
-    describe: Delay = Delay(5.8, 8.1)
-    index: Delay = Delay(11.0, 33.0)
-    align_accepted: Delay = Delay(4.8, 6.9)
-    align_refused: Delay = Delay(4.0, 9.0)
-    verify_images_accepted: Delay = Delay(16.7, 24.0)
-    verify_images_refused: Delay = Delay(1.6, 9.3)
-    check_loop: Delay = Delay(1.3, 10.0)
-    solve: Delay = Delay(14.0, 32.0)
-    apply_solution: Delay = Delay(2.2, 4.0)
+_ACCESS_POINT = ""  # a station beside the agents, which go by name
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +99,10 @@ class Simulation:
             member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
             self._members[member.peer] = member
             self._schedule_next_frame(member)
+        self.airs: dict[NetworkModel, SharedAir] = {}  # of the access points
+        for network in dict.fromkeys(network for *_, network in agents):
+            if network.air is not None:
+                self.airs[network] = SharedAir(network.air, rng.spawn(1)[0], self._schedule)
         kept = StoredMap() if store is None else store.load()
         restored = restored_runs(kept, config.merge.enter_m)
         self._store = store
@@ -242,12 +189,24 @@ class Simulation:
                         log.add_correction(effect.stamp_ns, effect.corrected_ms)
 
     def _send_up(self, member: _SimulatedAgent, frames: Sequence[Bytes]) -> None:
-        arrival_ns = member.up.arrival_ns(message_bytes(frames), self.now_ns) + self._draw(
-            self._delays.receive
-        )
-        self._schedule(
-            arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
-        )
+        size = message_bytes(frames)
+
+        def on_air_done() -> None:
+            arrival_ns = member.up.arrival_ns(size, self.now_ns) + self._draw(self._delays.receive)
+            self._schedule(
+                arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
+            )
+
+        self._over_the_air(member, member.name, size, on_air_done)
+
+    def _over_the_air(
+        self, member: _SimulatedAgent, station: str, size: int, done: Callable[[], None]
+    ) -> None:
+        """Call `done` when a message has passed the shared air of this member, at once without one."""
+        if (air := self.airs.get(member.network)) is None:
+            done()
+        else:
+            air.send(station, member.name, size, done)
 
     # The edge.
 
@@ -266,10 +225,15 @@ class Simulation:
 
     def _send_down(self, effect: ed.SendToPeer) -> None:
         member, frames = self._members[effect.peer_id], effect.frames
-        arrival_ns = member.down.arrival_ns(message_bytes(frames), self.now_ns)
-        self._schedule(
-            arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
-        )
+        size = message_bytes(frames)
+
+        def on_air_done() -> None:
+            arrival_ns = member.down.arrival_ns(size, self.now_ns)
+            self._schedule(
+                arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
+            )
+
+        self._over_the_air(member, _ACCESS_POINT, size, on_air_done)
 
     def _apply_to_mapper(
         self, message: ed.AddRun | ed.SetPresence | ed.AddKeyframe | ed.DropRun
@@ -382,7 +346,7 @@ class _SimulatedAgent:
         rngs: list[np.random.Generator],
     ) -> None:
         self.name, self.peer = hello.name, peer_id(hello.run_id)
-        self.machine, self.incoming = machine, incoming
+        self.machine, self.incoming, self.network = machine, incoming, network
         self.up = Channel(network.up, network.round_trip_ms, rngs[0])
         self.down = Channel(network.down, network.round_trip_ms, rngs[1])
         self.busy_until_ns = self.frames_count = 0

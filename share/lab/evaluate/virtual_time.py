@@ -25,8 +25,9 @@ from share.files.writing import atomic_write, writable_dir
 from share.files.yaml_file import read_settings
 from share.geometry.camera import Rig
 from share.lab.evaluate.emulated_network import LinkAssignment
+from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
 from share.lab.evaluate.real_time import MapMembership, Progress, RunOptions
-from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation, TrackedFrame
+from share.lab.evaluate.simulation import Simulation, TrackedFrame
 from share.lab.evaluate.tracker_runs import strict_tracker
 from share.metrics.local_error import LocalError
 from share.odometry.error_model.network import open_error_model
@@ -69,7 +70,7 @@ def play_in_virtual_time(
     tracker_settings = settings.tracker, settings.inertial, settings.sequencer
     tracked = track_session(session.folder.resolve(), *tracker_settings, error_source)
     links = LinkAssignment.parse(options.link)
-    links.check(session.agents)
+    links.check(session.agents, virtual=True)
     start_ns = min(frames[0].arrival_ns for _, frames in tracked.values() if frames)
     members = [
         (

@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 
+from share.lab.evaluate.report import markdown
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.statistics import (
     MEASURES,
@@ -45,6 +47,22 @@ RUNS = [
     run("covins-g", "two", (30.0, 40.0), (1.0, 2.0), 50),
     run("covins-g", "three", (500.0, 500.0), (9.0, 9.0), 900),  # share has not played it
 ]
+
+
+RECORD = {
+    "machine": {"cpu": "a CPU", "cores": 2, "system": "Linux", "load": 0.5},
+    "began": "2026-11-27",
+    "version": "0.3.0",
+}
+TRIALS = [SimpleNamespace(record=RECORD)]
+
+
+def test_errors_are_those_of_the_first_policy_beside_the_base():
+    """Whether or not the base is named first."""
+    for runs in (RUNS, RUNS[1:] + RUNS[:1]):
+        text = markdown(runs, TRIALS, "covins-g")
+        assert "## Errors with `share`" in text
+        assert "at most those with `covins-g` in 2 of 3 runs" in text
 
 
 def found(policy: str) -> dict[str, tuple[float, float]]:

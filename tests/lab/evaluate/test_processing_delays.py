@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import DataError, ShareError, UsageError
-from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
 from share.lab.evaluate.virtual_time import read_delays
 
 

@@ -13,7 +13,8 @@ from helpers.room_simulation import MS, tracked_frames
 from share.config import Config, EdgeConfig
 from share.geometry.camera import Camera
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
-from share.lab.evaluate.simulation import Delay, ProcessingDelays, Sampled, Simulation
+from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.simulation import Simulation
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
@@ -34,6 +35,7 @@ def world(
     seconds: float = 6.0,
     store: MapStore | None = None,
     day: int = 0,
+    link: str = "wifi5",
     **costs: Delay,
 ) -> Simulation:
     """store: a map that the edge continues. day: the runs of another day have other numbers."""
@@ -42,7 +44,7 @@ def world(
         (
             replace(person.hello, run_id=person.hello.run_id + day),
             tracked_frames(person, seconds),
-            NETWORK_PRESETS["wifi5"],
+            NETWORK_PRESETS[link],
         )
         for person in people
     ]
@@ -73,6 +75,17 @@ def test_a_sampled_delay_has_the_measured_quantiles() -> None:
     measured = Sampled((0.0, 0.0, 0.0, 2.0, 5.0))
     drawn = np.array([measured.draw_ns(x) for x in rng.standard_normal(20_000)]) / MS
     assert np.percentile(drawn, [0, 25, 50, 75, 100]) == pytest.approx([0, 0, 0, 2, 5], abs=0.06)
+
+
+def test_agents_of_one_access_point_share_its_air() -> None:
+    """Two agents send the same over either; over shared air each message waits for those of both."""
+    own, shared = (world("fixed", link=link) for link in ("wifi5", "shared-5"))
+    assert own.airs == {} and len(shared.airs) == 1
+    [air] = shared.airs.values()
+    sent = sum(one["bytes_up"] + one["bytes_down"] for one in shared.reports().values())
+    assert sent * 8 / 5e6 < air.busy_ns / 1e9 < 7.0
+    own_ms, shared_ms = (corrected_ms(room, "ann") + corrected_ms(room, "bob") for room in (own, shared))
+    assert np.median(shared_ms) > np.median(own_ms)
 
 
 def test_keyframe_work_after_a_frame_delays_the_next_one() -> None:

@@ -32,6 +32,7 @@ from share.lab.emulate.motion.placement import MIN_DISTANCE_M, PathToPlace, plac
 from share.lab.emulate.motion.robot import INITIAL_STILL_S
 from share.lab.emulate.motion.route import Floor, floor_from_occupancy
 from share.lab.emulate.motion.spec import (
+    PAPER_S,
     BoardSpec,
     EurocSpec,
     PaperSpec,
@@ -48,7 +49,6 @@ from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
 from share.types import F64, AgentKind
 
-PAPER_S = 60.0
 PAPER_NAMES = ("user1", "user2", "robot")
 PAPER_LENGTHS_M: dict[int, tuple[float, float, float]] = {
     1: (82.56, 17.21, 10.06),
@@ -147,7 +147,8 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
     agents += _simulated_agents(requests, layout, [_fixed_path(agent) for agent in agents], seconds, seed)
     order = [name for a in requests for name in _agent_names(a)]
     if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != PAPER_S:
-        notes = [*notes, f"an experiment of the paper lasts {PAPER_S:g} s"]
+        part = f"; the session has its first {seconds:g} s" if seconds < PAPER_S else ""
+        notes = [*notes, f"an experiment of the paper lasts {PAPER_S:g} s{part}"]
     return MotionPlan(layout, tuple(sorted(agents, key=lambda a: order.index(a.name))), tuple(notes))
 
 
@@ -231,10 +232,12 @@ def _simulated_agents(
         texts += [a.text] * len(own)
     if not members:
         return []
-    floor = floor_from_occupancy(Occupancy.from_layout(layout))
+    floor, planned_s = floor_from_occupancy(Occupancy.from_layout(layout)), seconds
     if any(isinstance(a.spec, PaperSpec) for a in requests):
-        floor, seconds = _floor_within(floor, _PAPER_SPACE_M), PAPER_S
-    paths = plan_crowd(FloorGraphs(floor), members, fixed, _gaze_targets(layout, rng), seconds, (seed, 73))
+        floor = _floor_within(floor, _PAPER_SPACE_M)
+        planned_s = PAPER_S
+    paths = plan_crowd(FloorGraphs(floor), members, fixed, _gaze_targets(layout, rng), planned_s, (seed, 73))
+    paths = [replace(p, end_ns=min(p.end_ns, p.start_ns + round(seconds * 1e9))) for p in paths]
     kinds = {"person": AgentKind.AR, "robot": AgentKind.ROBOT}
     return [
         PlannedAgent(

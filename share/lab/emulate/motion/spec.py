@@ -109,9 +109,12 @@ class BoardSpec:
         _check_range("vigour", self.vigour, 0.1, 2.0, "times the usual speed")
 
 
+PAPER_S = 60.0  # of an experiment of the paper
+
+
 @dataclass(frozen=True)
 class PaperSpec:
-    """`paper:1` .. `paper:5`: the three agents of one of the paper's experiments, 60 s."""
+    """`paper:1` .. `paper:5`: the three agents of one of the paper's experiments, its first 60 s at most."""
 
     number: int = 1
 

@@ -61,6 +61,16 @@ def test_a_missing_file_is_refused(warehouse, tmp_path):
         plan_motions([f"tum:{tmp_path}/none.tum"], warehouse, 10.0, 1)
 
 
+@pytest.mark.slow
+def test_an_experiment_of_the_paper_lasts_as_long_as_the_session(warehouse):
+    found, whole = (plan_motions(["paper:2"], warehouse, seconds, 1) for seconds in (12.0, 60.0))
+    assert found.notes == ("an experiment of the paper lasts 60 s; the session has its first 12 s",)
+    for part, all_of_it in zip(found.agents, whole.agents, strict=True):
+        assert (part.path.end_ns - part.path.start_ns, whole.notes) == (12 * 10**9, ())
+        stamps = every(part.path, 20, 12.0)
+        assert (part.path.poses(stamps) == all_of_it.path.poses(stamps)).all()
+
+
 @pytest.mark.long
 def test_real_motion_is_placed(warehouse, shared_data):
     folder = shared_data / "motion" / "tumvi" / "room1"

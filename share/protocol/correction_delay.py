@@ -1,0 +1,113 @@
+"""The delay from a frame to the correction that answers it, as the agent and as the edge see it.
+
+d = tau_track + tau_comm + tau_comp: the agent measures all of it, and tau_track; the edge tau_comp.
+"""
+
+from __future__ import annotations
+
+import math
+
+_TIME_CONSTANT_S = 1.0  # of the filters: at 1 Hz the newest delay has a weight of 0.63
+_MAX_ACKNOWLEDGED = 64  # keyframes that a correction may still answer
+_MAX_WAITING = 1000  # keyframes; further ones do not change which one waits longest
+
+
+class FilteredDelay:
+    """Average of delays, ms, by which older ones fade with time. None before the first."""
+
+    def __init__(self) -> None:
+        self.ms: float | None = None
+        self._updated_ns = 0
+
+    def add(self, ms: float, now_ns: int) -> None:
+        """Add a delay measured now."""
+        elapsed_s = max(0, now_ns - self._updated_ns) / 1e9
+        weight = 1.0 if self.ms is None else -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
+        self.ms = (self.ms or 0.0) + weight * (ms - (self.ms or 0.0))
+        self._updated_ns = now_ns
+
+
+class CorrectionDelay:
+    """Delay d of one agent, filtered; times by the agent's clock, ns.
+
+    d is the time until the acknowledgement, which every keyframe has, and from there to the correction, which
+    some lead to. A keyframe that is not acknowledged counts as late as it is.
+    """
+
+    def __init__(self) -> None:
+        self._to_ack, self._to_correction = FilteredDelay(), FilteredDelay()
+        self._waiting: dict[int, tuple[int, int]] = {}  # arrival of the frame and sending, by keyframe id
+        self._acknowledged_ms: dict[int, float] = {}  # after the frame's arrival, by id, of the newest
+        self._newest_ack_ms = 0.0
+
+    def add_keyframe(self, keyframe: int, arrived_ns: int, sent_ns: int) -> None:
+        """Add a keyframe that is sent now."""
+        if len(self._waiting) < _MAX_WAITING:
+            self._waiting[keyframe] = arrived_ns, sent_ns
+
+    def acknowledge(self, next_keyframe: int, now_ns: int) -> list[float]:
+        """Record that the edge has all keyframes below an id. Return what each new one took since it was
+        sent, ms."""
+        acks_ms = []
+        for keyframe in [keyframe for keyframe in self._waiting if keyframe < next_keyframe]:
+            arrived_ns, sent_ns = self._waiting.pop(keyframe)
+            self._acknowledged_ms[keyframe] = (now_ns - arrived_ns) / 1e6
+            self._to_ack.add(self._acknowledged_ms[keyframe], now_ns)
+            acks_ms.append((now_ns - sent_ns) / 1e6)
+            self._newest_ack_ms = acks_ms[-1]
+        while len(self._acknowledged_ms) > _MAX_ACKNOWLEDGED:
+            del self._acknowledged_ms[next(iter(self._acknowledged_ms))]
+        return acks_ms
+
+    def correct(self, keyframe: int, corrected_ms: float, now_ns: int) -> None:
+        """Record the first correction that answers a keyframe, so long after its frame arrived."""
+        acknowledged_ms = self._acknowledged_ms.get(keyframe, corrected_ms)
+        self._to_correction.add(max(0.0, corrected_ms - acknowledged_ms), now_ns)
+
+    def ms(self, now_ns: int) -> float | None:
+        """Return the delay, ms; None before the first keyframe."""
+        if self._to_ack.ms is None and not self._waiting:
+            return None
+        return max(self._to_ack.ms or 0.0, self.waiting_ms(now_ns)) + (self._to_correction.ms or 0.0)
+
+    def ack_ms(self, now_ns: int) -> float:
+        """Return how long the newest acknowledgement took, or how long one is overdue, if longer; 0 before
+        the first keyframe."""
+        waiting = [(now_ns - sent_ns) / 1e6 for _, sent_ns in self._oldest_waiting()]
+        return max([self._newest_ack_ms, *waiting])
+
+    def waiting_ms(self, now_ns: int) -> float:
+        """Return how long ago the frame of the oldest keyframe that is not acknowledged arrived; 0 without
+        one."""
+        return max([(now_ns - arrived_ns) / 1e6 for arrived_ns, _ in self._oldest_waiting()], default=0.0)
+
+    def _oldest_waiting(self) -> list[tuple[int, int]]:
+        """Return the times of the keyframe that has waited longest; none if nothing waits."""
+        return [next(iter(self._waiting.values()))] if self._waiting else []
+
+
+_MAX_COMPUTING = 64  # newest keyframes of a run that a correction may still answer
+
+
+class ComputationDelay:
+    """tau_comp of one run: from a keyframe's arrival at the edge until the correction that answers it is
+    sent, filtered, ms; 0 before the first. Times by the edge's clock, ns."""
+
+    def __init__(self) -> None:
+        self._filtered = FilteredDelay()
+        self._received_ns: dict[int, int] = {}
+
+    def add_keyframe(self, keyframe: int, now_ns: int) -> None:
+        """Add a keyframe that arrives now."""
+        self._received_ns[keyframe] = now_ns
+        if len(self._received_ns) > _MAX_COMPUTING:
+            del self._received_ns[next(iter(self._received_ns))]
+
+    def answer(self, keyframe: int, now_ns: int) -> None:
+        """Record that a correction answers a keyframe, the first that does."""
+        if (received_ns := self._received_ns.pop(keyframe, None)) is not None:
+            self._filtered.add((now_ns - received_ns) / 1e6, now_ns)
+
+    @property
+    def ms(self) -> float:
+        return self._filtered.ms or 0.0

@@ -1,0 +1,66 @@
+"""Which keyframe candidates an agent sends: by the edge's rate and window, and the better ones first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from share.protocol.agent_ledger import KeyframeScore
+from share.scheduling.keyframe_window import KeyframeWindow
+from share.timing import TokenBucket
+from share.types import KeyframeCandidate
+from share.wire.messages import Rate
+
+RATE_BURST = 2.0  # keyframes that may be saved up under a rate limit
+_MIN_RATE_HZ = 0.1  # that an edge cannot undercut: without keyframes it could not evaluate again
+
+
+class KeyframePace:
+    """The pace of one agent, without a limit until the edge sends a rate. Times: agent's clock, ns."""
+
+    def __init__(self) -> None:
+        self._bucket, self._score = TokenBucket(RATE_BURST), KeyframeScore()
+        self._window: KeyframeWindow | None = None  # None: the edge asks for none
+        self._poses = TokenBucket(1.0)
+
+    @property
+    def hz(self) -> float | None:
+        """The rate; None: no limit."""
+        return self._bucket.hz
+
+    @property
+    def window(self) -> int | None:
+        """How many keyframes may be unacknowledged; None: as many as the link allows."""
+        return None if self._window is None else self._window.size
+
+    def begin_session(self, now_ns: int) -> None:
+        """Forget what an earlier session of the edge asked for."""
+        self._bucket.set_rate(None, now_ns)
+        self._poses.set_rate(None, now_ns)
+        self._window = None
+
+    def set_rate(self, rate: Rate, now_ns: int) -> None:
+        """Take what the edge asks for."""
+        self._bucket.set_rate(max(rate.hz, _MIN_RATE_HZ), now_ns)
+        self._poses.set_rate(rate.pose_hz, now_ns)
+        if not rate.is_windowed:
+            self._window = None
+        elif self._window is None:
+            self._window = KeyframeWindow()
+            self._bucket.empty(now_ns)  # slow start: what waits for the edge already goes first
+
+    def acknowledge(self, acks_ms: Sequence[float], now_ns: int) -> None:
+        """Record how long acknowledgements took, ms."""
+        if self._window is not None:
+            for ack_ms in acks_ms:
+                self._window.acknowledge(ack_ms, now_ns)
+
+    def take_pose(self, now_ns: int) -> bool:
+        """Return whether a pose is sent now."""
+        return self._poses.take(now_ns)
+
+    def take(self, candidate: KeyframeCandidate, unacknowledged: int, now_ns: int) -> bool:
+        """Return whether this candidate is sent. unacknowledged: keyframes; 0 while the edge is away, for
+        which they are kept."""
+        is_preferred = self._score.is_above_median(candidate)
+        has_room = self._window is None or unacknowledged < self._window.size
+        return has_room and self._bucket.take(now_ns, is_preferred)

@@ -1,0 +1,77 @@
+"""The policy of one edge at work, and the history of its decisions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from share.config import ControlConfig
+from share.scheduling.policies import POLICIES, AgentReport
+from share.scheduling.qoe import QoeParameters, qoe
+from share.scheduling.room_budget import Grant
+from share.timing import RingBuffer
+from share.types import AgentKind
+
+_MAX_SERIES = 5000  # newest evaluations of an agent in a report: an hour at more than one a second
+
+
+class RatedEvaluation(NamedTuple):
+    """An evaluation, its QoE, and the rate set by it; None: no limit. track_ms, comm_ms, comp_ms: parts of
+    the delay."""
+
+    t_s: float | None
+    delay_ms: float | None
+    error_cm: float | None
+    qoe: float | None
+    rate_hz: float | None
+    track_ms: float | None
+    comm_ms: float | None
+    comp_ms: float | None
+
+
+class RateScheduler:
+    """A policy and the history of its decisions, for one edge. Agents go by name; a new run starts anew."""
+
+    def __init__(self, config: ControlConfig, policy: str) -> None:
+        self._config, self._policy = config, POLICIES[policy](config)
+        self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
+        self.is_windowed = self._policy.is_windowed
+        self._history: dict[str, RingBuffer] = {}  # of all runs of a name
+        self._latest: dict[str, RatedEvaluation] = {}  # of the present run
+
+    def begin_run(self, agent: str) -> None:
+        """Start a new run of an agent, without a limit until its first evaluation."""
+        self._policy.forget(agent)
+        self._latest.pop(agent, None)
+
+    def forget(self, agent: str) -> None:
+        """Drop all state and history of a name."""
+        self.begin_run(agent)
+        self._history.pop(agent, None)
+
+    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+        """Return what an agent that joins may send; None: everything."""
+        return self._policy.first_grant(agent, kind)
+
+    def evaluate(self, agent: str, report: AgentReport, comp_ms: float, t_s: float) -> Grant | None:
+        """Return what the agent may send from now on; None: everything. comp_ms: the edge's part of its
+        delay. t_s: time for the report."""
+        grant, evaluation = self._policy.evaluate(agent, report), report.evaluation
+        delay_ms, error_cm, track_ms = evaluation.delay_ms, evaluation.error_cm, evaluation.track_ms
+        value = qoe(delay_ms, error_cm, QoeParameters.from_config(self._config, report.kind, agent))
+        comm_ms = max(0.0, delay_ms - track_ms - comp_ms)
+        rate_hz = None if grant is None else grant.hz
+        fields = t_s, delay_ms, error_cm, value, rate_hz, track_ms, comm_ms, comp_ms
+        rated = RatedEvaluation(*(None if x is None else round(x, 4) for x in fields))
+        self._history.setdefault(agent, RingBuffer(len(rated), _MAX_SERIES)).add(rated)
+        self._latest[agent] = rated
+        return grant
+
+    def report(self, agent: str | None) -> dict[str, float | None]:
+        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run; None: no run."""
+        rated = None if agent is None else self._latest.get(agent)
+        return {name: None if rated is None else getattr(rated, name) for name in ("rate_hz", "qoe")}
+
+    def series(self, agent: str) -> dict[str, list[float | None]]:
+        """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""
+        rated = self._history.get(agent, RingBuffer(len(RatedEvaluation._fields), 0))
+        return {name: rated.column(k) for k, name in enumerate(RatedEvaluation._fields)}

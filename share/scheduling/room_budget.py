@@ -1,0 +1,247 @@
+"""The room's budget: what each agent may send where the air that all share is short.
+
+The air is a server whose turns all agents share, so a keyframe that alone takes T s takes T / (1 - load)
+(M/G/1 with processor sharing: L. Kleinrock, *Queueing Systems* II, 1976, section 4.4). T follows from what is
+measured, A, the time that keyframes take, and L, how many a second arrive: T = A / (1 + A L). It does not
+depend on the load, so rates that follow from it do not swing.
+
+Where keyframes at the rates that all want take longer than a wearer notices, every agent begins with its
+least rate. What is left goes in small steps to whom a step gains most for its air, as long as nobody notices;
+then only where a step gains a headset more QoE than the delay that it causes costs all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
+from share.types import AgentKind
+from share.wire.messages import Evaluation
+
+LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
+SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
+_WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
+_POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
+FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
+_LOAD_STEP = 0.01
+_MAX_LOAD = 0.95  # beyond, the formula has no meaning
+_STEP_HZ = 0.25
+_TIME_CONSTANT_S = 2.0  # of measured times and rates
+_SILENT_S = 3.0  # an agent that has not reported for so long takes no air
+
+
+@dataclass(frozen=True)
+class AgentAir:
+    """What the room knows of one agent. wanted_hz: rate by its own QoE. keyframe_s: A. delay_ms, error_cm:
+    as in `qoe`. drift_cm: part of the error that grows between keyframes. hz: rate of its keyframes, poses
+    that it sends a second, both filtered."""
+
+    terms: QoeParameters
+    wanted_hz: float
+    keyframe_s: float
+    delay_ms: float
+    error_cm: float | None
+    drift_cm: float
+    hz: float
+    pose_hz: float
+    updated_ns: int
+
+    @property
+    def least_hz(self) -> float:
+        return min(LEAST_HZ[self.terms.form], self.wanted_hz)
+
+
+@dataclass(frozen=True)
+class Grant:
+    """What an agent may send: keyframes and poses a second. pose_hz None: every pose."""
+
+    hz: float
+    pose_hz: float | None = None
+
+
+@dataclass(frozen=True)
+class RoomBudget:
+    """State of the room: agents by name. Immutable: `with_report` returns the next one."""
+
+    agents: Mapping[str, AgentAir] = field(default_factory=dict)
+
+    def with_report(self, name: str, reported: AgentAir) -> RoomBudget:
+        """Return the budget after an agent's report, whose keyframe_s, hz and pose_hz are filtered here.
+        Agents that are silent are dropped."""
+        now_ns, before = reported.updated_ns, self.agents.get(name)
+        if before is not None:
+            elapsed_s = max(0.0, (now_ns - before.updated_ns) / 1e9)
+            weight = -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
+            reported = replace(
+                reported,
+                **{
+                    key: getattr(before, key) + weight * (getattr(reported, key) - getattr(before, key))
+                    for key in ("keyframe_s", "hz", "pose_hz")
+                },
+            )
+        present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < _SILENT_S * 1e9}
+        return RoomBudget({**present, name: reported})
+
+    def without(self, name: str) -> RoomBudget:
+        """Return the budget of a room that an agent has left."""
+        return RoomBudget({n: a for n, a in self.agents.items() if n != name})
+
+    def air_s(self, agent: AgentAir) -> float:
+        """Return T of an agent, s."""
+        keyframes_hz = sum(a.hz + _POSE_COST * a.pose_hz for a in self.agents.values())
+        return agent.keyframe_s / (1 + agent.keyframe_s * keyframes_hz)
+
+    @property
+    def is_short(self) -> bool:
+        """Whether not everyone can send what it wants without anyone noticing."""
+        wanted = {name: agent.wanted_hz for name, agent in self.agents.items()}
+        return _Prediction(self, is_thinned=False).is_noticed(wanted)
+
+    def allocate(self) -> dict[str, Grant]:
+        """Return what every agent may send where the air is short."""
+        rates = _Prediction(self, is_thinned=True).allocate()
+        return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
+
+
+def scarce_grant(form: AgentKind, hz: float | None = None) -> Grant:
+    """Return what an agent may send where the air is short, or not known yet. hz: its least rate if None."""
+    return Grant(LEAST_HZ[form] if hz is None else hz, SCARCE_POSE_HZ[form])
+
+
+class _Prediction:
+    """Predicts the QoE of all agents by their rates. is_thinned: with fewer poses."""
+
+    def __init__(self, budget: RoomBudget, is_thinned: bool) -> None:
+        self._agents = budget.agents
+        self._air_s = {name: budget.air_s(agent) for name, agent in self._agents.items()}
+        self._pose_load = 0.0
+        for name, agent in self._agents.items():
+            pose_hz = SCARCE_POSE_HZ[agent.terms.form] if is_thinned else FULL_POSE_HZ
+            self._pose_load += _POSE_COST * pose_hz * self._air_s[name]
+
+    def load(self, rates: Mapping[str, float]) -> float:
+        load = self._pose_load + sum(hz * self._air_s[name] for name, hz in rates.items())
+        return min(load, _MAX_LOAD)
+
+    def is_noticed(self, rates: Mapping[str, float]) -> bool:
+        """Return whether a keyframe of any agent would take longer on the air than a wearer notices."""
+        return max(self._air_s.values()) / (1 - self.load(rates)) > ACCEPTED_DELAY_MS / 1e3
+
+    def allocate(self) -> dict[str, float]:
+        """Return the rates, Hz: least ones, then steps to whom they gain most."""
+        rates = {name: agent.least_hz for name, agent in self._agents.items()}
+        while True:
+            load = self.load(rates)
+            cost = self._cost(rates, load)
+            gains = {
+                name: self._gain(name, hz, load) / max(self._air_s[name], 1e-6)
+                for name, hz in rates.items()
+                if hz + _STEP_HZ <= self._agents[name].wanted_hz
+            }
+            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n)}
+            worth = {n: gain for n, gain in gains.items() if gain > _STEP_HZ * cost and self._comes_first(n)}
+            steps = free or worth
+            if not steps or load >= _MAX_LOAD:
+                return rates
+            best = max(steps, key=lambda name: steps[name])
+            rates = {**rates, best: rates[best] + _STEP_HZ}
+
+    def _is_step_noticed(self, rates: Mapping[str, float], name: str) -> bool:
+        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ})
+
+    def _comes_first(self, name: str) -> bool:
+        """Return whether others may be delayed for an agent: for headsets, and among robots alone."""
+        form = self._agents[name].terms.form
+        return form is AgentKind.AR or all(agent.terms.form is form for agent in self._agents.values())
+
+    def _gain(self, name: str, hz: float, load: float) -> float:
+        """Return what a step of its rate gains an agent, weighted, at the same load."""
+        more, now = (self._qoe(name, rate, load) for rate in (hz + _STEP_HZ, hz))
+        return _WEIGHT[self._agents[name].terms.form] * (more - now)
+
+    def _cost(self, rates: Mapping[str, float], load: float) -> float:
+        """Return the QoE, weighted, that all agents together lose by a load of one more."""
+        return (
+            sum(
+                _WEIGHT[agent.terms.form]
+                * (self._qoe(name, rates[name], load) - self._qoe(name, rates[name], load + _LOAD_STEP))
+                for name, agent in self._agents.items()
+            )
+            / _LOAD_STEP
+        )
+
+    def _qoe(self, name: str, hz: float, load: float) -> float:
+        """Return the QoE of an agent, by its rate and the load of the air."""
+        agent = self._agents[name]
+        elsewhere_ms = max(0.0, agent.delay_ms - 1e3 * agent.keyframe_s)
+        delay_ms = elsewhere_ms + 1e3 * self._air_s[name] / (1 - load)
+        if agent.error_cm is None:
+            return qoe(delay_ms, None, agent.terms)
+        drift = min(agent.drift_cm, agent.error_cm)
+        drift_square = drift**2 * max(agent.hz, 1e-3) / max(hz, 1e-3)  # a random walk between keyframes
+        error_cm = math.sqrt(agent.error_cm**2 - drift**2 + drift_square)
+        return qoe(delay_ms, error_cm, agent.terms)
+
+
+_PERIOD_NS = 500_000_000  # between two allocations
+_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: it has its least rate
+
+
+class Room:
+    """The budget of one edge over time. Counts are of messages that have arrived so far."""
+
+    def __init__(self) -> None:
+        self._budget = RoomBudget()
+        self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
+        self._grants: dict[str, Grant] = {}
+        self._allocated_ns = 0
+
+    def grant(
+        self,
+        name: str,
+        terms: QoeParameters,
+        wanted_hz: float,
+        evaluation: Evaluation,
+        counts: tuple[int, int],
+        now_ns: int,
+    ) -> Grant:
+        """Return what an agent may send, by its evaluation. counts: its keyframes and poses so far."""
+        hz, pose_hz = self._rates(name, counts, now_ns)
+        reported = AgentAir(
+            terms=terms,
+            wanted_hz=wanted_hz,
+            keyframe_s=max(0.0, evaluation.ack_ms - evaluation.rtt_ms) / 1e3,
+            delay_ms=evaluation.delay_ms,
+            error_cm=evaluation.error_cm,
+            drift_cm=evaluation.drift_cm,
+            hz=hz,
+            pose_hz=pose_hz,
+            updated_ns=now_ns,
+        )
+        self._budget = self._budget.with_report(name, reported)
+        if counts[0] < _SLOW_START_KEYFRAMES:
+            return scarce_grant(terms.form)
+        if not self._budget.is_short:
+            self._grants = {}
+            return Grant(wanted_hz)
+        if name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
+            self._grants, self._allocated_ns = self._budget.allocate(), now_ns
+        return self._grants[name]
+
+    def forget(self, name: str) -> None:
+        """Drop an agent."""
+        self._budget = self._budget.without(name)
+        self._counts.pop(name, None)
+        self._grants.pop(name, None)
+
+    def _rates(self, name: str, counts: tuple[int, int], now_ns: int) -> tuple[float, float]:
+        """Return keyframes and poses a second since the agent's last report."""
+        since_ns, before = self._counts.get(name, (now_ns, counts))
+        self._counts[name] = now_ns, counts
+        elapsed_s = (now_ns - since_ns) / 1e9
+        if elapsed_s <= 0:
+            return 0.0, 0.0
+        hz, pose_hz = ((now - then) / elapsed_s for now, then in zip(counts, before, strict=True))
+        return hz, pose_hz

@@ -1,0 +1,199 @@
+"""The room's budget: who sends how much where the air is short."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from share.config import AgentQoe, ControlConfig
+from share.scheduling.qoe import QoeParameters
+from share.scheduling.room_budget import (
+    LEAST_HZ,
+    SCARCE_POSE_HZ,
+    AgentAir,
+    Grant,
+    Room,
+    RoomBudget,
+    scarce_grant,
+)
+from share.types import AgentKind
+from share.wire.messages import Evaluation
+
+S = 1_000_000_000
+AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
+TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in (AR, ROBOT)}
+
+
+def agent(kind: AgentKind = AR, keyframe_ms: float = 40.0, **given: float) -> AgentAir:
+    fields = {"wanted_hz": 1.5, "delay_ms": 60 + keyframe_ms, "error_cm": 1.5, "drift_cm": 1.0} | given
+    rates = {"hz": 1.0, "pose_hz": 30.0, "updated_ns": 0}
+    return AgentAir(terms=TERMS[kind], keyframe_s=keyframe_ms / 1e3, **(rates | fields))  # type: ignore[arg-type]
+
+
+def room(*agents: AgentAir) -> RoomBudget:
+    return RoomBudget({f"a{k}": one for k, one in enumerate(agents)})
+
+
+class Air:
+    """A channel on which a keyframe alone takes `alone_ms`: what each agent reports and is granted."""
+
+    def __init__(self, alone_ms: float, kinds: tuple[AgentKind, ...], wanted_hz: float = 1.5) -> None:
+        self.alone_ms, self.kinds, self.wanted_hz = alone_ms, kinds, wanted_hz
+        self.room, self.now_s = Room(), 0.0
+        self.counts = [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
+        self.grants = [scarce_grant(kind) for kind in kinds]
+        self.history: list[list[float]] = []
+
+    def load(self) -> float:
+        poses = sum(30.0 if g.pose_hz is None else g.pose_hz for g in self.grants)
+        return min(0.98, self.alone_ms / 1e3 * (sum(g.hz for g in self.grants) + 0.017 * poses))
+
+    def play(self, seconds: float) -> None:
+        end = self.now_s + seconds
+        while self.now_s < end:
+            self.now_s += 0.5
+            keyframe_ms = self.alone_ms / (1 - self.load())
+            for k, kind in enumerate(self.kinds):
+                sent, pose_hz = self.grants[k].hz, self.grants[k].pose_hz
+                self.counts[k][0] += 0.5 * sent
+                self.counts[k][1] += 0.5 * (30.0 if pose_hz is None else pose_hz)
+                told = Evaluation(0, 60 + keyframe_ms, 1.2, 10.0, 5.0, 5 + keyframe_ms, 0.5)
+                counts = round(self.counts[k][0]), round(self.counts[k][1])
+                self.grants[k] = self.room.grant(
+                    f"a{k}", TERMS[kind], self.wanted_hz, told, counts, round(self.now_s * S)
+                )
+            self.history.append([g.hz for g in self.grants])
+
+
+def test_an_agent_whose_air_is_not_known_has_its_least_rate() -> None:
+    told = Evaluation(0, 20.0, 1.0)
+    grants = [Room().grant("a0", TERMS[AR], 5.0, told, (n, 0), S) for n in range(3)]
+    assert grants == [scarce_grant(AR), scarce_grant(AR), Grant(5.0)]
+
+
+def test_with_ample_air_everyone_gets_what_it_wants() -> None:
+    air = Air(2.0, (AR, AR, ROBOT) * 4)
+    air.play(20)
+    assert all(grant == Grant(1.5) for grant in air.grants)
+
+
+def test_where_the_air_is_short_robots_yield_and_poses_are_thinned() -> None:
+    air = Air(34.0, (AR, AR, ROBOT) * 4)
+    air.play(20)
+    for kind, grant in zip(air.kinds, air.grants, strict=True):
+        assert grant.pose_hz == SCARCE_POSE_HZ[kind]
+        assert LEAST_HZ[kind] <= grant.hz <= 1.5
+    headsets, robots = (
+        [g.hz for k, g in zip(air.kinds, air.grants, strict=True) if k is kind] for kind in (AR, ROBOT)
+    )
+    assert max(robots) < min(headsets)
+    assert air.load() < 0.4
+
+
+@pytest.mark.parametrize("alone_ms", [18.0, 34.0, 54.0])
+def test_rates_settle(alone_ms: float) -> None:
+    """Within 10 s, though every 0.5 s all react to what all did: headsets' stay, robots' move by two steps at
+    most."""
+    air = Air(alone_ms, (AR, AR, ROBOT) * 4)
+    air.play(60)
+    for kind, rates in zip(air.kinds, zip(*air.history[20:], strict=True), strict=True):
+        assert max(rates) - min(rates) <= (0.0 if kind is AR else 0.5)
+
+
+def test_after_the_air_clears_all_get_what_they_want_again() -> None:
+    air = Air(34.0, (AR, AR, ROBOT) * 2)
+    air.play(30)
+    assert min(grant.hz for grant in air.grants) < 1.5
+    air.alone_ms = 3.0
+    air.play(15)
+    assert all(grant == Grant(1.5) for grant in air.grants)
+
+
+def test_time_on_the_air_follows_from_what_is_measured_at_any_load() -> None:
+    for load in (0.1, 0.5, 0.9):
+        keyframes_hz = load / 0.04
+        measured = agent(keyframe_ms=40 / (1 - load), hz=keyframes_hz, pose_hz=0.0)
+        assert room(measured).air_s(measured) == pytest.approx(0.04)
+
+
+def test_more_goes_to_whom_it_gains_more() -> None:
+    """Two headsets on 18 ms of air; one drifts."""
+    drifts, is_still = (
+        agent(keyframe_ms=18.5, wanted_hz=4.0, drift_cm=1.4),
+        agent(keyframe_ms=18.5, wanted_hz=4.0, drift_cm=0.1),
+    )
+    granted = room(drifts, is_still, *[agent(keyframe_ms=18.5, wanted_hz=4.0, drift_cm=0.1)] * 2).allocate()
+    assert granted["a0"].hz > granted["a1"].hz
+
+
+def test_a_robot_delays_no_headset_unless_it_has_the_ar_form() -> None:
+    """`control.agents` gives the latency-critical one that form."""
+    bob = ControlConfig(agents={"bob": AgentQoe(form="ar")})
+    urgent = replace(agent(ROBOT), terms=QoeParameters.from_config(bob, ROBOT, "bob"))
+    granted = room(agent(AR), agent(ROBOT), urgent).allocate()
+    assert granted["a1"] == Grant(LEAST_HZ[ROBOT], SCARCE_POSE_HZ[ROBOT])
+    assert granted["a2"] == granted["a0"]
+    among_robots = room(agent(ROBOT), agent(ROBOT)).allocate()
+    assert among_robots["a0"].hz > LEAST_HZ[ROBOT]
+
+
+def test_agents_that_are_silent_or_have_left_take_no_air() -> None:
+    budget = room(agent(), agent()).with_report("a2", agent(updated_ns=10 * S))
+    assert list(budget.agents) == ["a2"]
+    assert list(budget.without("a2").agents) == []
+    assert list(budget.without("nobody").agents) == ["a2"]
+
+
+def test_measurements_are_filtered() -> None:
+    before = agent(keyframe_ms=40.0)
+    after = RoomBudget({"a0": before}).with_report("a0", agent(keyframe_ms=400.0, updated_ns=S // 2))
+    assert 0.04 < after.agents["a0"].keyframe_s < 0.2
+    later = after.with_report("a0", agent(keyframe_ms=400.0, updated_ns=9 * S))
+    assert later.agents["a0"].keyframe_s == pytest.approx(0.4, rel=0.05)
+
+
+numbers = st.floats(0, 1e6)
+agents = st.builds(
+    agent,
+    st.sampled_from([AR, ROBOT]),
+    st.floats(0, 1e7),
+    wanted_hz=st.floats(0.1, 5.0),
+    delay_ms=numbers,
+    error_cm=st.none() | numbers,
+    drift_cm=numbers,
+    hz=st.floats(0, 100),
+    pose_hz=st.floats(0, 200),
+)
+
+
+@given(st.lists(agents, min_size=1, max_size=6))
+def test_no_report_breaks_it(reported: list[AgentAir]) -> None:
+    budget = room(*reported)
+    assert budget.is_short in (True, False)
+    for name, grant in budget.allocate().items():
+        one = budget.agents[name]
+        assert min(LEAST_HZ[one.terms.form], one.wanted_hz) <= grant.hz <= one.wanted_hz
+
+
+def test_a_whole_room_takes_milliseconds() -> None:
+    """24 agents, twice a second: counted in QoE evaluations, not on this machine's clock."""
+    import share.scheduling.room_budget as module
+
+    calls = 0
+    whole, counted = (
+        [agent(AR, wanted_hz=5.0), agent(AR, wanted_hz=5.0), agent(ROBOT, wanted_hz=5.0)] * 8,
+        module.qoe,
+    )
+
+    def counting(*terms: object) -> float:
+        nonlocal calls
+        calls += 1
+        return counted(*terms)  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "qoe", counting)
+        room(*[replace(one, keyframe_s=0.002) for one in whole]).allocate()
+    assert 0 < calls < 60_000

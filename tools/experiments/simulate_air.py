@@ -1,0 +1,239 @@
+"""Policies where all agents share the air of one access point, in virtual time with modelled mapping.
+
+    python tools/experiments/simulate_air.py [--agents 12] [--air shared-5 shared-8] [--seeds 501:511] \\
+        [--policies share covins-g fixed@1.5] [--halved 30:50] [--set SECTION.NAME=VALUE] [--json FILE]
+
+Two headsets per robot walk for a minute in a warehouse that grows with their number; frames at 30 Hz,
+keyframes of 27 kB. `fixed@HZ`: policy fixed at this rate. `--halved A:B`: the air has half its rate from A to
+B s. Prints a Markdown table, means over seeds. How agents are served is sampled twice a second from the
+agents themselves, from their first keyframe to the end, whether or not the edge hears of it:
+
+* QoE of headsets and robots: mean, and the 5th percentile over a run's samples of all headsets; of the
+  delay until corrections (a keyframe that is not acknowledged counts as late as it is) and the expected
+  error. `by round trip`: of headsets, with round trip and processing as delay, or how long a keyframe has
+  not been acknowledged, if longer: that of earlier figures.
+* corrections of headsets, 95th percentile, ms; age of a headset's newest correction, 95th percentile, s.
+* error of poses in the shared map, cm rms; keyframes a second of all; load of the air.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from share import startup
+
+startup.prepare_process()
+
+import numpy as np  # noqa: E402
+from keyframe_set import KeyframeSet  # noqa: E402
+from measure_joins import configured  # noqa: E402
+from modelled_mapper import ModelledMapper, RecognitionModel  # noqa: E402
+from scarce_room import scarce_room  # noqa: E402
+from simulate import FRAME_NS, SIMULATED, looks, shared_errors, truth_of, which  # noqa: E402
+from tool_main import exit_code, line  # noqa: E402
+
+from share.config import NEAR_M, Config  # noqa: E402
+from share.errors import UsageError  # noqa: E402
+from share.lab.evaluate.emulated_network import load_network  # noqa: E402
+from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
+from share.lab.evaluate.simulation import Simulation  # noqa: E402
+from share.protocol import agent_events as ev  # noqa: E402
+from share.protocol.agent import Agent  # noqa: E402
+from share.scheduling.qoe import QoeParameters, qoe  # noqa: E402
+from share.types import AgentKind  # noqa: E402
+
+HEAD = ("air", "policy", "AR QoE: mean, p5", "by round trip", "robot QoE", "AR corrections p95, ms")
+HEAD += ("AR age p95, s", "cm: AR, robots", "sent Hz: AR, robots", "air", "maps", "took s")
+_SAMPLE_TICKS = 10  # of 50 ms
+
+Row = dict[str, Any]
+
+
+class SampledSimulation(Simulation):
+    """A simulation that samples how agents are served. samples: by agent, (t_s, delay, round trip and
+    processing, ms, error, cm, rate, Hz or NaN, age of its newest correction, s)."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        self.samples: dict[str, list[tuple[float, ...]]] = {}
+        self._corrected_s: dict[str, float] = {}
+        self._ticks = 0
+        super().__init__(*arguments, **{**named, "on_effect": self._note})
+
+    def _note(self, name: str, effect: ev.AgentEffect) -> None:
+        if isinstance(effect, ev.CorrectionApplied) and effect.corrected_ms is not None:
+            self._corrected_s[name] = 1e-9 * self.now_ns
+
+    def _tick(self) -> None:
+        self._ticks += 1
+        if self._ticks % _SAMPLE_TICKS == 0:
+            for member in self._members.values():
+                if (found := member.machine.evaluation(-1, self.now_ns)) is not None:
+                    now_s, hz = 1e-9 * self.now_ns, member.machine.report()["rate_hz"]
+                    trip_ms = max(found.rtt_ms + found.track_ms, _waiting_ms(member.machine, self.now_ns))
+                    sampled = now_s, found.delay_ms, trip_ms, found.error_cm or math.nan
+                    age_s = now_s - self._corrected_s.get(member.name, 0.0)
+                    self.samples.setdefault(member.name, []).append((*sampled, hz or math.nan, age_s))
+        super()._tick()
+
+    def call_at(self, t_s: float, action: Any) -> None:
+        """Call `action` at a time of the simulation."""
+        self._schedule(round(t_s * 1e9) - self.now_ns, action)
+
+
+def _waiting_ms(agent: Agent, now_ns: int) -> float:
+    return agent._self_evaluation.delay.waiting_ms(now_ns)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--agents", type=int, default=12)
+    parser.add_argument("--air", nargs="+", default=["shared-5", "shared-8"])
+    parser.add_argument("--seeds", default="401:403", metavar="FIRST:END")
+    parser.add_argument("--policies", nargs="+", default=["share", "covins-g", "fixed@1.5"])
+    parser.add_argument("--halved", metavar="A:B")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    return exit_code("simulate_air", lambda: simulate(options))
+
+
+def simulate(options: argparse.Namespace) -> None:
+    """Run every policy on every air, seed by seed."""
+    first, end = map(int, options.seeds.split(":"))
+    configs = {policy: with_policy(policy, options.set) for policy in options.policies}
+    rows: list[Row] = []
+    for seed in range(first, end):
+        made = scarce_room(options.agents, seed)
+        for air in options.air:
+            for policy, config in configs.items():
+                rows.append({"policy": policy, **play(made, config, air, seed, options.halved)})
+                if options.json:
+                    options.json.write_text(json.dumps(rows) + "\n")
+    print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))))
+    for air in options.air:
+        for policy in configs:
+            print(line(cells_of([row for row in rows if (row["air"], row["policy"]) == (air, policy)])))
+
+
+def with_policy(text: str, settings: list[str]) -> Config:
+    """Return the settings with a policy, such as `fixed@0.5`. Raises UsageError."""
+    name, _, hz = text.partition("@")
+    if name not in SIMULATED:
+        raise UsageError(f"--policies {text}: expected one of {', '.join(SIMULATED)}, or fixed@HZ")
+    config = configured([*settings, *([f"control.fixed_rate_hz={hz}"] if hz else [])])
+    return replace(config, edge=replace(config.edge, policy=name))
+
+
+def play(made: KeyframeSet, config: Config, air: str, seed: int, halved: str | None = None) -> Row:
+    """Simulate one run."""
+    began = time.monotonic()
+    who = list(made.agents.values())
+    first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
+    last_ns = max(agent.keyframes[-1].stamp_ns for agent in who)
+    rng = np.random.default_rng((seed, 9))
+    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]  # cameras are not in step
+    seen = [looks(agent, zero_ns, last_ns) for agent, zero_ns in zip(who, zeros_ns, strict=True)]
+    truth = {
+        a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
+        for a, zero_ns in zip(who, zeros_ns, strict=True)
+    }
+    known = truth_of(made, NEAR_M, config.control.far_m)
+    mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
+    network = load_network(air)
+    members = [(a.hello, frames, network) for a, frames in zip(who, seen, strict=True)]
+    world = SampledSimulation(config, members, ProcessingDelays(), seed, mapper)
+    if halved is not None:
+        _halve(world, *map(float, halved.split(":")))
+    seconds = (last_ns - first_ns) / 1e9
+    world.run(seconds)
+    return {
+        "air": air,
+        "seed": seed,
+        "seconds": seconds,
+        "agents": {a.hello.name: _agent_row(world, a.hello.name, config) for a in who},
+        "error_cm": shared_errors(world.localised, truth),
+        "busy": sum(one.busy_ns for one in world.airs.values()) / world.now_ns,
+        "maps": len({own["map_id"] for own in world.mapper.report()["agents"].values()}),
+        "mapper": world.mapper_busy_ns / world.now_ns,
+        "took_s": time.monotonic() - began,
+    }
+
+
+def _halve(world: SampledSimulation, begin_s: float, end_s: float) -> None:
+    for air in world.airs.values():
+        world.call_at(begin_s, lambda air=air: setattr(air, "mbps", air.mbps / 2))
+        world.call_at(end_s, lambda air=air: setattr(air, "mbps", air.mbps * 2))
+
+
+def _agent_row(world: SampledSimulation, name: str, config: Config) -> Row:
+    kind = AgentKind.AR if name.startswith("ar") else AgentKind.ROBOT
+    terms = QoeParameters.from_config(config.control, kind)
+    samples = np.array(world.samples.get(name, [])).reshape(-1, 6)
+    corrected_ms = world.logs[name].frames().corrected_ms
+    columns = zip(*samples.T.tolist(), strict=True)
+    rated = [(qoe(d, _known(e), terms), qoe(trip, _known(e), terms)) for _, d, trip, e, _, _ in columns]
+    return {
+        "qoe": [each for each, _ in rated],
+        "qoe_by_round_trip": [each for _, each in rated],
+        "t_s": samples[:, 0].tolist(),
+        "delay_ms": samples[:, 1].tolist(),
+        "expected_cm": samples[:, 3].tolist(),
+        "rate_hz": samples[:, 4].tolist(),
+        "age_s": samples[:, 5].tolist(),
+        "corrected_ms": corrected_ms[corrected_ms > 0].tolist(),
+        "sent": world.reports()[name]["sent"],
+    }
+
+
+def _known(error_cm: float) -> float | None:
+    return None if math.isnan(error_cm) else error_cm
+
+
+def pooled(row: Row, kind: str, figure: str) -> np.ndarray[Any, Any]:
+    """Return a figure of all agents of a kind in one run, joined."""
+    return np.concatenate([np.atleast_1d(a[figure]) for n, a in row["agents"].items() if n.startswith(kind)])
+
+
+def cells_of(rows: list[Row]) -> list[str]:
+    """Return the cells of the runs of one policy on one air."""
+
+    def over_runs(of_run: Any) -> float:
+        return float(np.nanmean([of_run(row) for row in rows]))
+
+    def sent_hz(row: Row, kind: str) -> float:
+        return float(pooled(row, kind, "sent").mean()) / row["seconds"]
+
+    def p95(values: np.ndarray[Any, Any]) -> float:
+        return float(np.percentile(values, 95)) if len(values) else math.nan
+
+    def error_cm(row: Row, kind: str) -> float:
+        found = [cm for name, cm in row["error_cm"].items() if name.startswith(kind)]
+        return float(np.mean(found)) if found else math.nan
+
+    return [
+        rows[0]["air"],
+        rows[0]["policy"],
+        f"{over_runs(lambda r: pooled(r, 'ar', 'qoe').mean()):.3f}, "
+        f"{over_runs(lambda r: np.percentile(pooled(r, 'ar', 'qoe'), 5)):.3f}",
+        f"{over_runs(lambda r: pooled(r, 'ar', 'qoe_by_round_trip').mean()):.3f}, "
+        f"{over_runs(lambda r: np.percentile(pooled(r, 'ar', 'qoe_by_round_trip'), 5)):.3f}",
+        f"{over_runs(lambda r: pooled(r, 'robot', 'qoe').mean()):.3f}",
+        f"{over_runs(lambda r: p95(pooled(r, 'ar', 'corrected_ms'))):.0f}",
+        f"{over_runs(lambda r: p95(pooled(r, 'ar', 'age_s'))):.1f}",
+        f"{over_runs(lambda r: error_cm(r, 'ar')):.2f}, {over_runs(lambda r: error_cm(r, 'robot')):.2f}",
+        f"{over_runs(lambda r: sent_hz(r, 'ar')):.2f}, {over_runs(lambda r: sent_hz(r, 'robot')):.2f}",
+        f"{over_runs(lambda r: r['busy']):.2f}",
+        f"{over_runs(lambda r: r['maps']):.1f}",
+        f"{over_runs(lambda r: r['took_s']):.0f}",
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
