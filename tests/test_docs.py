@@ -27,6 +27,10 @@ NOT_OURS = {
     "CompressedImage",
     "MemoryError",
     "RecursionError",
+    "ValueError",
+    "PoseStamped",
+    "PoseWithCovariance",
+    "PointCloud2",
 }
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
 COMMON_LINE = re.compile(r"^Also: (.+(?:\n.+)*)", re.MULTILINE)
@@ -252,5 +256,4 @@ def test_the_example_of_the_package_runs(plain_session: Path) -> None:
     )
     names: dict[str, Any] = {}
     exec(textwrap.dedent(code).replace("room1/ann", str(plain_session / "ar1")), names)
-    assert names["stamps_ns"].shape == (45,)
-    assert names["T_odom_body"].shape == (45, 4, 4)
+    assert [pose.T_odom_body.shape for pose in names["poses"]] == [(4, 4)] * 45

@@ -118,7 +118,7 @@ def test_samples_that_are_none_are_refused():
     tracker = Tracker(rig())
     with pytest.raises(ShareError, match=r"gyro: has shape \(2,\), expected three numbers"):
         tracker.feed_imu(1, [0, 0], [0, 0, 9.81])
-    with pytest.raises(ShareError, match="stamp_ns: 1.5 is not an integer; give nanoseconds"):
+    with pytest.raises(ShareError, match=r"stamp_ns: 1\.5 is not an integer; give nanoseconds"):
         tracker.feed_imu(1.5, [0, 0, 0], [0, 0, 9.81])
     with pytest.raises(ShareError, match="stamp_ns: -1 is out of range"):
         tracker.feed_images(-1, GRAY, GRAY)
@@ -141,7 +141,7 @@ def test_without_features_there_is_no_pose_but_a_reason():
 
 def test_what_cannot_be_tracked_or_opened_is_a_share_error(tmp_path):
     alone = replace(rig().without_imu(), cam1=None, T_cam1_cam0=None)
-    with pytest.raises(ShareError, match="^rig: "):
+    with pytest.raises(ShareError, match=r"^rig: "):
         Tracker(alone)
     with pytest.raises(ShareError, match="no such file"):
         open_recording(tmp_path / "missing")

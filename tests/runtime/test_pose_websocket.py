@@ -101,5 +101,5 @@ def test_what_is_no_websocket_is_no_trouble(served, capfd):
 def test_a_port_in_use_and_a_wrong_origin_are_refused(served):
     with pytest.raises(ShareError, match="the port is in use; stop the other server"):
         open_pose_sinks([f"ws://{served.host}"], "bob")
-    with pytest.raises(ShareError, match="--poses-origin app.example: expected a page's origin"):
+    with pytest.raises(ShareError, match=r"--poses-origin app\.example: expected a page's origin"):
         open_pose_sinks(["ws://127.0.0.1:0"], "bob", ["app.example"])
