@@ -148,11 +148,7 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     for stream in STREAMS:
         kinds = (ros.IMU_MSG,) if stream == IMU else _IMAGE_TYPES
         candidates = [name for name, kind in topics.items() if kind in kinds]
-        topic = (
-            _named_topic(named[stream], candidates, file)
-            if stream in named
-            else guess_topic(stream, candidates)
-        )
+        topic = _named_topic(named.get(stream), stream, candidates, file) or guess_topic(stream, candidates)
         if topic:
             by_stream[stream] = topic
     if CAM0 not in by_stream:
@@ -164,10 +160,16 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     return by_stream
 
 
-def _named_topic(name: str, candidates: list[str], file: McapFile) -> str:
+def _named_topic(name: str | None, stream: str, candidates: list[str], file: McapFile) -> str | None:
+    """Return the candidate of this name; None without a name. Our own recordings' name, which every
+    calibration that SHARE writes has, need not be there."""
+    if name is None:
+        return None
     for topic in (name, *(name + suffix for suffix in ros.SUFFIXES)):
         if topic in candidates:
             return topic
+    if name == ros.TOPICS[stream]:
+        return None
     known = ", ".join(candidates) or "none"
     raise ConfigError(f"{file.path}: has no topic {name}, which the calibration names; topics: {known}")
 
