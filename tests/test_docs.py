@@ -31,6 +31,7 @@ NOT_OURS = {
     "PoseStamped",
     "PoseWithCovariance",
     "PointCloud2",
+    "FileStorage",
 }
 TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
 COMMON_LINE = re.compile(r"^Also: (.+(?:\n.+)*)", re.MULTILINE)

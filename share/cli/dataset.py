@@ -11,7 +11,7 @@ import click
 from share.cli import options
 from share.cli.commands import CommandGroup
 from share.cli.terminal import print_note, progress
-from share.errors import UsageError
+from share.errors import ConfigError, UsageError
 
 
 @click.group(cls=CommandGroup, prefix="dataset ")
@@ -29,14 +29,16 @@ def dataset() -> None:
 @options.frames
 @options.as_json
 def info(source: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
-    """Describe a recording (streams, rates, gaps, calibration, ground truth) or an edge's map.
+    """Describe a recording (streams, rates, gaps, calibration, ground truth) or an edge's map; the topics of
+    ROS messages without a calibration.
 
     \b
     Example:  share dataset info rec/kitchen
               share dataset info session/ann --json
               share dataset info room.sqlite
     """
-    from share.recordings.describe import describe_recording
+    from share.recordings.bags.message_file import is_message_file, open_messages
+    from share.recordings.describe import describe_messages, describe_recording
     from share.runtime.source import open_source
     from share.store.export import describe_map
     from share.store.map_store import MapStore, is_map
@@ -47,7 +49,14 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
         found = describe_map(MapStore.read(Path(source)))
         click.echo(json.dumps(found) if as_json else _map_text(found))
         return
-    description = describe_recording(open_source(source, calib, frames))
+    try:
+        description = describe_recording(open_source(source, calib, frames))
+    except ConfigError as error:  # no calibration: its topics at least
+        if calib is not None or not is_message_file(Path(source)):
+            raise
+        description = describe_messages(open_messages(Path(source)), str(error))
+        click.echo(json.dumps(description) if as_json else _messages_text(description))
+        return
     click.echo(json.dumps(description) if as_json else _description_text(description))
 
 
@@ -198,6 +207,15 @@ def _description_text(d: dict[str, Any]) -> str:
         if truth
         else "  truth  none"
     )
+    return "\n".join(lines + [f"  note: {note}" for note in d["notes"]])
+
+
+def _messages_text(d: dict[str, Any]) -> str:
+    lines = [f"{d['name']}: ROS messages, {d['duration_s']:.1f} s"]
+    for name, topic in d["topics"].items():
+        gaps = f", {topic['gaps']} gaps (longest {topic['longest_gap_s']:.3g} s)" if topic["gaps"] else ""
+        rate = f" at {topic['rate_hz']:.5g} Hz" if topic["count"] > 1 else ""
+        lines.append(f"  {name}  {topic['type']}  {topic['count']}{rate}{gaps}")
     return "\n".join(lines + [f"  note: {note}" for note in d["notes"]])
 
 
