@@ -10,7 +10,7 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
-from share.cli.terminal import print_note, progress
+from share.cli.terminal import progress
 from share.errors import ConfigError, UsageError
 
 
@@ -136,37 +136,43 @@ def recover(broken: Path, out: Path, as_json: bool) -> None:
     click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(broken, out, result))
 
 
-@dataset.command(short_help="Write an edge's map as TUM and PLY files.")
-@click.argument("map_file", metavar="MAP", type=options.PATH)
-@click.option("--out", required=True, metavar="DIR", type=options.PATH, help="A new folder.")
+@dataset.command(short_help="Write a map, recording or run for other programs.")
+@click.argument("source")
+@click.option(
+    "--out", required=True, metavar="PATH", type=options.PATH, help="A new folder; X.mcap or X.rrd for those."
+)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["tum", "mcap", "rrd", "colmap", "kitti"]),
+    default="tum",
+    help="tum (of a map: NAME.tum, points.ply, loops.csv), mcap (ROS 2 messages for Foxglove and RViz), rrd "
+    "(Rerun), colmap (text model with pictures) or kitti (poses of cam0).",
+)
+@options.calib
+@options.frames
 @options.as_json
-def export(map_file: Path, out: Path, as_json: bool) -> None:
-    """Export the trajectories, points and loops of an edge's map for other programs.
+def export(source: str, out: Path, kind: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
+    """Export an edge's map, a recording or the folder of a run for other programs.
 
-    DIR gets NAME.tum for each agent, points.ply and loops.csv; if MAP holds several maps, each gets its own
-    folder. The edge may be running.
+    A map gives its keyframes, an edge may be running with it; a recording is tracked and gives its poses in
+    odom, with its keyframes; a run gives the trajectories in it. With --format tum, for maps only, DIR gets
+    NAME.tum for each agent, points.ply and loops.csv. If a map file holds several maps, each gets its own
+    folder, or a frame of its own in one file.
 
     \b
     Example:  share dataset export room.sqlite --out room
+              share dataset export room.sqlite --format colmap --out room-colmap
+              share dataset export rec/kitchen --format mcap --out kitchen-3d.mcap
     """
-    from share.store.export import export_map as run
-    from share.store.map_store import MapStore
+    from share.cli.dataset_export import export_map_tables, export_scenes, open_scenes
 
-    if not map_file.is_file():
-        raise UsageError(f"{map_file}: no such file")
-    map_state = MapStore.read(map_file).load()
-    for complaint in map_state.problems:
-        print_note(str(map_file), complaint)
-    with progress(len(map_state.keyframes), "exporting") as bar:
-        exported = run(map_state, out, bar)
-    if as_json:
-        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in exported.items()}))
-        return
-    for name, e in exported.items():
-        click.echo(
-            f"{e.folder}: map {name}, {e.keyframes} keyframes of {', '.join(e.agents)}; "
-            f"{e.points} points, {e.loops} loops"
-        )
+    if kind == "tum":
+        if calib or frames:
+            raise UsageError("--calib and --frames work only with recordings; name another --format")
+        export_map_tables(source, out, as_json)
+    else:
+        export_scenes(open_scenes(source, calib, frames), out, kind, as_json)
 
 
 def _check_mcap(out: Path, source: str | Path) -> None:

@@ -102,18 +102,21 @@ def from_camera_info(info: Any, where: str) -> Camera:
         raise ConfigError(f"{where}: {error}; give the calibration with --calib") from None
 
 
-def to_tf(rig: Rig, stamp_ns: int) -> Any:
-    """Return the extrinsics of a rig as transforms body -> cam0 -> cam1, depth."""
+def to_tf(rig: Rig, stamp_ns: int, prefix: str = "") -> Any:
+    """Return the extrinsics of a rig as transforms body -> cam0 -> cam1, depth. prefix: of frames' names."""
     edges = {(ros.BODY, CAM0): rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         edges[CAM0, CAM1] = se3.inverse(rig.T_cam1_cam0)
     if rig.T_depth_cam0 is not None:
         edges[CAM0, DEPTH] = se3.inverse(rig.T_depth_cam0)
-    transforms = [_transform(parent, child, T, stamp_ns) for (parent, child), T in edges.items()]
+    transforms = [
+        to_transform(prefix + parent, prefix + child, T, stamp_ns) for (parent, child), T in edges.items()
+    ]
     return ros.make_message(ros.TF, transforms=transforms)
 
 
-def _transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
+def to_transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
+    """Return the pose T_parent_child (4, 4) as a TransformStamped."""
     x, y, z = T[:3, 3].tolist()
     qx, qy, qz, qw = se3.quat_from_matrix(T[:3, :3]).tolist()
     return ros.make_message(
