@@ -13,6 +13,7 @@ import click
 import pytest
 
 from share.cli.main import cli
+from share.cli.verbosity import VerboseOption
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -56,7 +57,11 @@ def documented() -> dict[str, str]:
 
 
 def options(command: click.Command) -> set[str]:
-    return {max(p.opts, key=len) for p in command.params if isinstance(p, click.Option)}
+    return {
+        max(p.opts, key=len)
+        for p in command.params
+        if isinstance(p, click.Option) and not isinstance(p, VerboseOption)  # which every command has
+    }
 
 
 def prose(text: str) -> str:

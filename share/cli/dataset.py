@@ -84,8 +84,15 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     default="mcap",
     help="mcap (one file of ROS 2 messages) or euroc (an EuRoC/ASL folder).",
 )
+@options.as_json
 def convert(
-    source: str, out: Path, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
+    source: str,
+    out: Path,
+    calib: str | None,
+    frames: slice | None,
+    jpeg: int | None,
+    kind: str,
+    as_json: bool,
 ) -> None:
     """Write a recording as MCAP (ROS 2 messages) or as an EuRoC/ASL folder.
 
@@ -111,7 +118,9 @@ def convert(
         else:
             to_euroc(opened, out, bar)
     options.print_losses(opened)
-    click.echo(f"{out}: {opened.images_count} frames")
+    count = opened.images_count
+    done = {"out": str(out), "format": kind, "frames": count, "skipped": opened.losses.counts}
+    click.echo(json.dumps(done) if as_json else f"{out}: {count} frames")
 
 
 @dataset.command(short_help="Recover a recording that was cut off.")
