@@ -1,4 +1,4 @@
-"""Track a recording: prints time, position and speed of the body for each frame.
+"""Track a recording: prints the time, position and speed of the body for each frame.
 
 python examples/track_recording.py room1/ann
 """
@@ -17,4 +17,5 @@ for frame in recording:
         print(f"{frame.stamp_ns}  {tracker.state}")
     else:
         x, y, z = pose.position
-        print(f"{frame.stamp_ns}  {x:7.3f} {y:7.3f} {z:7.3f} m  {np.linalg.norm(pose.velocity):.2f} m/s")
+        speed = np.nan if pose.velocity is None else np.linalg.norm(pose.velocity)
+        print(f"{frame.stamp_ns}  {x:7.3f} {y:7.3f} {z:7.3f} m  {speed:.2f} m/s")

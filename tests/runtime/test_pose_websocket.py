@@ -98,6 +98,53 @@ def test_what_is_no_websocket_is_no_trouble(served, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.long
+def test_an_agent_serves_the_poses_that_it_sends(share, plain_session, tmp_path):
+    """By WebSocket and by UDP at once, the same."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"ws://127.0.0.1:{free.getsockname()[1]}"
+    got: list[dict[str, object]] = []
+
+    def read() -> None:
+        end = time.monotonic() + 30
+        while not got and time.monotonic() < end:
+            with contextlib.suppress(OSError, exceptions.WebSocketException):
+                for text in client.connect(address, proxy=None):
+                    got.append(json.loads(text))
+            time.sleep(0.05)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    config = tmp_path / "config.yaml"
+    config.write_text("agent: {finish_s: 0.1}\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as app:
+        app.bind(("127.0.0.1", 0))
+        udp = f"udp://127.0.0.1:{app.getsockname()[1]}"
+        options = (
+            "--kind",
+            "ar",
+            "--edge",
+            "127.0.0.1:1",
+            "--config",
+            config,
+            "--poses",
+            address,
+            "--poses",
+            udp,
+        )
+        share("agent", plain_session / "ar1", "--name", "ann", *options)
+        reader.join(timeout=30)
+        app.setblocking(False)
+        sent = {}
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                message = json.loads(app.recv(2048))
+                sent[message["sequence"]] = message
+    assert len(sent) == 45 and len(got) >= 10
+    assert all(message == sent[message["sequence"]] for message in got)
+
+
 def test_a_port_in_use_and_a_wrong_origin_are_refused(served):
     with pytest.raises(ShareError, match="the port is in use; stop the other server"):
         open_pose_sinks([f"ws://{served.host}"], "bob")
