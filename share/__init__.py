@@ -1,20 +1,20 @@
 """SHARE: user-centric collaborative SLAM for people in AR headsets and robots in one room.
 
 Each agent tracks itself; one edge server joins their maps and sends each agent corrections. The command
-line is `share --help`. Track a recording from Python:
+line is `share --help`. Track a recording from Python (docs/lookup/api.md):
 
-    from share.config import Config
-    from share.runtime.offline_tracking import track
-    from share.runtime.source import open_source
+    from share import Tracker, open_recording
 
-    run = track(open_source("room1/ann"), Config(), on_result=lambda result: None)
-    stamps_ns, T_odom_body = run.trajectory  # (N,), (N, 4, 4)
+    recording = open_recording("room1/ann")
+    tracker = Tracker(recording.rig)
+    poses = [pose for frame in recording if (pose := tracker.track(frame))]
 
 The packages, from the top down (each imports only those below it; `help(share.odometry)` says more of
 one):
 
     cli          one file a command
     lab          emulator, calibration, evaluation, training: what a headset never loads
+    library      what `from share import` gives to programs
     runtime      the processes: agent, edge, mapper; status page
     cameras      live cameras
     store        the edge's map on disk
@@ -37,4 +37,59 @@ Settings are in `config`, the values that all packages use in `types`, and units
 docs/understand/architecture.md.
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from share.config import Config
+    from share.errors import ShareError
+    from share.geometry.camera import Rig
+    from share.library.agent import AgentThread as Agent
+    from share.library.edge import EdgeThread as Edge
+    from share.library.recording import load_calibration, open_recording
+    from share.library.tracker import Tracker
+    from share.runtime.pose import Pose
+    from share.types import Frame
+
 __version__ = "0.2.0"
+
+_NAMES = {  # where each name is; imported when it is used, so that `import share` is quick
+    "Agent": ("share.library.agent", "AgentThread"),
+    "Config": ("share.config", "Config"),
+    "Edge": ("share.library.edge", "EdgeThread"),
+    "Frame": ("share.types", "Frame"),
+    "Pose": ("share.runtime.pose", "Pose"),
+    "Rig": ("share.geometry.camera", "Rig"),
+    "ShareError": ("share.errors", "ShareError"),
+    "Tracker": ("share.library.tracker", "Tracker"),
+    "load_calibration": ("share.library.recording", "load_calibration"),
+    "open_recording": ("share.library.recording", "open_recording"),
+}
+
+__all__ = [  # the interface that stays; all else may change between releases
+    "Agent",
+    "Config",
+    "Edge",
+    "Frame",
+    "Pose",
+    "Rig",
+    "ShareError",
+    "Tracker",
+    "load_calibration",
+    "open_recording",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of the interface on first use (PEP 562)."""
+    if name not in _NAMES:
+        raise AttributeError(f"module 'share' has no attribute '{name}'")
+    module, attribute = _NAMES[name]
+    value = globals()[name] = getattr(import_module(module), attribute)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

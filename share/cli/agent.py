@@ -64,8 +64,17 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--poses",
-    metavar="udp://H:P",
-    help="Send every pose to a program at this address (docs/do/integrate.md).",
+    metavar="udp://H:P|ws://H:P",
+    multiple=True,
+    help="Send every pose to a program at this address by UDP, or serve them there by WebSocket "
+    "(docs/do/integrate.md). May be repeated.",
+)
+@click.option(
+    "--poses-origin",
+    "origins",
+    metavar="URL",
+    multiple=True,
+    help="A web page that may read --poses ws://…, such as https://app.example. May be repeated.",
 )
 @options.config
 @options.verbose
@@ -85,7 +94,8 @@ def agent(
     frames: slice | None,
     camera: camera_options.CameraOptions,
     out: Path | None,
-    poses: str | None,
+    poses: tuple[str, ...],
+    origins: tuple[str, ...],
     config_file: Path | None,
     verbose: bool,
     as_json: bool,
@@ -102,7 +112,7 @@ def agent(
     """
     settings = options.load_config(config_file)
     from share.runtime.agent import AgentRun
-    from share.runtime.pose_feed import PoseFeed
+    from share.runtime.pose_feed import open_pose_sinks
     from share.runtime.signals import stop_on_signal
     from share.wire.messages import Hello
 
@@ -118,7 +128,7 @@ def agent(
     options.print_notes(opened)
     hello = Hello(options.agent_name(name), agent_kind, run_id, opened.rig, streamed)
     errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
-    feed = None if poses is None else PoseFeed(poses, hello.name)
+    sinks = open_pose_sinks(poses, hello.name, origins)
     run = AgentRun(
         opened,
         hello,
@@ -129,7 +139,7 @@ def agent(
         live_line.show,
         verbose,
         errors,
-        feed,
+        sinks,
     )
     with stop_on_signal(run.stop):
         run.run()
@@ -189,12 +199,9 @@ def _error_estimator(
     """Return the estimator of the tracking error, None if it is off. Raises UsageError, DataError."""
     if true_error:
         return _true_error(source)
-    if not settings.agent.error_model:
-        return None
-    from share.odometry.error_model.network import open_error_model
-    from share.runtime.error_estimators import BackgroundErrorModel
+    from share.runtime.error_estimators import model_estimator
 
-    return BackgroundErrorModel(open_error_model(settings.agent.error_model), print_line)
+    return model_estimator(settings.agent.error_model, print_line)
 
 
 def _true_error(source: Source) -> ErrorEstimator:

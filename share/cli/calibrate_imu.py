@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
+from share.cli.completion import complete_profile
 from share.cli.terminal import Stages, aligned_table, print_note
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ _SYMBOLS = {"density": "N", "instability": "B", "walk": "K"}
     "--profile",
     "profile_name",
     metavar="P",
+    shell_complete=complete_profile,
     help="Compare with the data sheet in this profile, such as d435i.",
 )
 @click.option(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from share.cli.completion import complete_profile
 from share.cli.terminal import LiveLine
 from share.errors import UsageError
 from share.timing import PeriodicTimer
@@ -27,6 +28,7 @@ profile = click.option(
     "--profile",
     "profile_name",
     metavar="P",
+    shell_complete=complete_profile,
     help=f"Camera profile: its name or YAML file.  [default: {PROFILE}]",
 )
 mode = click.option("--mode", metavar="WxH[@HZ]", help="Image size and rate.  [default: the profile's]")

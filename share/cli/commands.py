@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from share.cli.verbosity import with_verbose
 from share.errors import UsageError
 
 # name: (module, attribute, one line of help). A literal table, so that a freezer sees every module.
@@ -93,10 +94,11 @@ class CommandGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self._rows:
-            return super().get_command(ctx, cmd_name)
+            added = super().get_command(ctx, cmd_name)
+            return None if added is None else with_verbose(added)
         module, attribute, _ = self._rows[cmd_name]
         command: click.Command = getattr(importlib.import_module(module), attribute)
-        return command
+        return with_verbose(command)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -10,8 +10,8 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
-from share.cli.terminal import print_note, progress
-from share.errors import UsageError
+from share.cli.terminal import progress
+from share.errors import ConfigError, UsageError
 
 
 @click.group(cls=CommandGroup, prefix="dataset ")
@@ -29,14 +29,16 @@ def dataset() -> None:
 @options.frames
 @options.as_json
 def info(source: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
-    """Describe a recording (streams, rates, gaps, calibration, ground truth) or an edge's map.
+    """Describe a recording (streams, rates, gaps, calibration, ground truth) or an edge's map; the topics of
+    ROS messages without a calibration.
 
     \b
     Example:  share dataset info rec/kitchen
               share dataset info session/ann --json
               share dataset info room.sqlite
     """
-    from share.recordings.describe import describe_recording
+    from share.recordings.bags.message_file import is_message_file, open_messages
+    from share.recordings.describe import describe_messages, describe_recording
     from share.runtime.source import open_source
     from share.store.export import describe_map
     from share.store.map_store import MapStore, is_map
@@ -47,7 +49,14 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
         found = describe_map(MapStore.read(Path(source)))
         click.echo(json.dumps(found) if as_json else _map_text(found))
         return
-    description = describe_recording(open_source(source, calib, frames))
+    try:
+        description = describe_recording(open_source(source, calib, frames))
+    except ConfigError as error:  # no calibration: its topics at least
+        if calib is not None or not is_message_file(Path(source)):
+            raise
+        description = describe_messages(open_messages(Path(source)), str(error))
+        click.echo(json.dumps(description) if as_json else _messages_text(description))
+        return
     click.echo(json.dumps(description) if as_json else _description_text(description))
 
 
@@ -75,8 +84,15 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     default="mcap",
     help="mcap (one file of ROS 2 messages) or euroc (an EuRoC/ASL folder).",
 )
+@options.as_json
 def convert(
-    source: str, out: Path, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
+    source: str,
+    out: Path,
+    calib: str | None,
+    frames: slice | None,
+    jpeg: int | None,
+    kind: str,
+    as_json: bool,
 ) -> None:
     """Write a recording as MCAP (ROS 2 messages) or as an EuRoC/ASL folder.
 
@@ -102,7 +118,9 @@ def convert(
         else:
             to_euroc(opened, out, bar)
     options.print_losses(opened)
-    click.echo(f"{out}: {opened.images_count} frames")
+    count = opened.images_count
+    done = {"out": str(out), "format": kind, "frames": count, "skipped": opened.losses.counts}
+    click.echo(json.dumps(done) if as_json else f"{out}: {count} frames")
 
 
 @dataset.command(short_help="Recover a recording that was cut off.")
@@ -127,37 +145,43 @@ def recover(broken: Path, out: Path, as_json: bool) -> None:
     click.echo(json.dumps(result._asdict()) if as_json else _recovery_text(broken, out, result))
 
 
-@dataset.command(short_help="Write an edge's map as TUM and PLY files.")
-@click.argument("map_file", metavar="MAP", type=options.PATH)
-@click.option("--out", required=True, metavar="DIR", type=options.PATH, help="A new folder.")
+@dataset.command(short_help="Write a map, recording or run for other programs.")
+@click.argument("source")
+@click.option(
+    "--out", required=True, metavar="PATH", type=options.PATH, help="A new folder; X.mcap or X.rrd for those."
+)
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["tum", "mcap", "rrd", "colmap", "kitti"]),
+    default="tum",
+    help="tum (of a map: NAME.tum, points.ply, loops.csv), mcap (ROS 2 messages for Foxglove and RViz), rrd "
+    "(Rerun), colmap (text model with pictures) or kitti (poses of cam0).",
+)
+@options.calib
+@options.frames
 @options.as_json
-def export(map_file: Path, out: Path, as_json: bool) -> None:
-    """Export the trajectories, points and loops of an edge's map for other programs.
+def export(source: str, out: Path, kind: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
+    """Export an edge's map, a recording or the folder of a run for other programs.
 
-    DIR gets NAME.tum for each agent, points.ply and loops.csv; if MAP holds several maps, each gets its own
-    folder. The edge may be running.
+    A map gives its keyframes, an edge may be running with it; a recording is tracked and gives its poses in
+    odom, with its keyframes; a run gives the trajectories in it. With --format tum, for maps only, DIR gets
+    NAME.tum for each agent, points.ply and loops.csv. If a map file holds several maps, each gets its own
+    folder, or a frame of its own in one file.
 
     \b
     Example:  share dataset export room.sqlite --out room
+              share dataset export room.sqlite --format colmap --out room-colmap
+              share dataset export rec/kitchen --format mcap --out kitchen-3d.mcap
     """
-    from share.store.export import export_map as run
-    from share.store.map_store import MapStore
+    from share.cli.dataset_export import export_map_tables, export_scenes, open_scenes
 
-    if not map_file.is_file():
-        raise UsageError(f"{map_file}: no such file")
-    map_state = MapStore.read(map_file).load()
-    for complaint in map_state.problems:
-        print_note(str(map_file), complaint)
-    with progress(len(map_state.keyframes), "exporting") as bar:
-        exported = run(map_state, out, bar)
-    if as_json:
-        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in exported.items()}))
-        return
-    for name, e in exported.items():
-        click.echo(
-            f"{e.folder}: map {name}, {e.keyframes} keyframes of {', '.join(e.agents)}; "
-            f"{e.points} points, {e.loops} loops"
-        )
+    if kind == "tum":
+        if calib or frames:
+            raise UsageError("--calib and --frames work only with recordings; name another --format")
+        export_map_tables(source, out, as_json)
+    else:
+        export_scenes(open_scenes(source, calib, frames), out, kind, as_json)
 
 
 def _check_mcap(out: Path, source: str | Path) -> None:
@@ -198,6 +222,15 @@ def _description_text(d: dict[str, Any]) -> str:
         if truth
         else "  truth  none"
     )
+    return "\n".join(lines + [f"  note: {note}" for note in d["notes"]])
+
+
+def _messages_text(d: dict[str, Any]) -> str:
+    lines = [f"{d['name']}: ROS messages, {d['duration_s']:.1f} s"]
+    for name, topic in d["topics"].items():
+        gaps = f", {topic['gaps']} gaps (longest {topic['longest_gap_s']:.3g} s)" if topic["gaps"] else ""
+        rate = f" at {topic['rate_hz']:.5g} Hz" if topic["count"] > 1 else ""
+        lines.append(f"  {name}  {topic['type']}  {topic['count']}{rate}{gaps}")
     return "\n".join(lines + [f"  note: {note}" for note in d["notes"]])
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
+from share.cli.completion import complete_profile
 from share.errors import ShareError
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     "--profile",
     default="d435i",
     metavar="NAME|FILE",
+    shell_complete=complete_profile,
     help="What this device should be: d435i, d435i-n100-headset, d435i-turtlebot4, laptop-edge, or a file.",
 )
 @click.option("--calib", metavar="DIR", type=options.PATH, help="Calibration of this device to check.")

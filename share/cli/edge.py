@@ -62,6 +62,7 @@ def edge(
     from contextlib import ExitStack, closing
 
     from share.cli.stderr import Stderr
+    from share.net.keys import edge_keys_for
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
@@ -69,7 +70,7 @@ def edge(
     from share.runtime.status_server import StatusServer
     from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
-    edge_key_pair = _edge_keys(keys, parse_address(bind, bind=True).local)
+    edge_key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
@@ -95,18 +96,6 @@ def edge(
                 stderr.print_line(f"status at http://{status.endpoint}/")
             report = run.run()
     click.echo(json.dumps(report) if as_json else _summary(report))
-
-
-def _edge_keys(folder: Path | None, local: bool) -> EdgeKeys | None:
-    """Return the keys in --keys, or those in the default folder if the edge is on a network.
-
-    None if there are none. Raises UsageError.
-    """
-    from share.net.keys import default_folder, edge_keys, has_pair
-
-    if folder is None and (local or not has_pair(default_folder())):
-        return None
-    return edge_keys(folder)
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:

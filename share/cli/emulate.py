@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from share.cli import options
+from share.cli.completion import complete_profile, complete_scene
 from share.cli.terminal import Stages
 
 _WORKERS = 2
@@ -33,6 +34,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--scene",
     required=True,
+    shell_complete=complete_scene,
     help="Room that is generated; see above.",
 )
 @click.option(
@@ -59,6 +61,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
     "profiles",
     multiple=True,
     metavar="[NAME=]PROFILE[:MODE]",
+    shell_complete=complete_profile,
     help="Device that records: d435i, euroc, tumvi (fisheye) or a YAML file; MODE such as 848x480@30.",
 )
 @click.option(

@@ -17,6 +17,7 @@ from share.cli.terminal import Column, LiveLine, column_table
 
 if TYPE_CHECKING:
     from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
+    from share.lab.evaluate.trial import Trial
 
 
 @click.group(cls=CommandGroup, prefix="evaluate ")
@@ -38,8 +39,15 @@ def evaluate() -> None:
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of link and scheduler.")
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=options.PATH, help="A new folder.")
+@options.as_json
 def run(
-    session: Path, policy: str | None, seed: int, config_file: Path | None, out: Path, **options_given: Any
+    session: Path,
+    policy: str | None,
+    seed: int,
+    config_file: Path | None,
+    out: Path,
+    as_json: bool,
+    **options_given: Any,
 ) -> None:
     """Play SESSION in real time with an edge and its agents, each its own process; or, with --virtual, with
     the same trackers and state machines in virtual time, independent of this machine's load.
@@ -51,6 +59,7 @@ def run(
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
     """
     from share.lab.evaluate.real_time import RunOptions
+    from share.lab.evaluate.report import PROTOCOL
     from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.trial import run_trial
     from share.recordings.session import read_session
@@ -60,7 +69,17 @@ def run(
     run_terms = RunOptions(config.edge.policy, seed=seed, **options_given)
     trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)))
     live.end()
-    click.echo(run_table(run_metrics(trial)))
+    metrics = run_metrics(trial)
+    document = {"protocol": PROTOCOL, "runs": [_run_document(metrics, trial)]}
+    click.echo(json.dumps(document, default=str) if as_json else run_table(metrics))
+
+
+def _run_document(metrics: RunMetrics, trial: Trial) -> dict[str, Any]:
+    """Return a run's metrics and record as plain data."""
+    from share.files.json_file import nan_to_none
+
+    values = dataclasses.asdict(metrics) | {"metres": metrics.metres}
+    return {**nan_to_none(values), "record": trial.record}
 
 
 @evaluate.command(short_help="Score runs: errors, latency, merges, QoE.")
@@ -79,7 +98,6 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
     \b
     Example:  share evaluate score runs/* --plots plots
     """
-    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write, check_writable, writable_dir
     from share.lab.evaluate.report import PROTOCOL, agents_csv
     from share.lab.evaluate.report_charts import draw_sessions
@@ -93,10 +111,7 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
     if csv_file is not None:
         atomic_write(csv_file, agents_csv(all_metrics))
     if as_json:
-        documents = [
-            nan_to_none(dataclasses.asdict(one) | {"metres": one.metres}) | {"record": trial.record}
-            for one, trial in zip(all_metrics, trials, strict=True)
-        ]
+        documents = [_run_document(one, trial) for one, trial in zip(all_metrics, trials, strict=True)]
         click.echo(json.dumps({"protocol": PROTOCOL, "runs": documents}, default=str))
         return
     for one, trial in zip(all_metrics, trials, strict=True):

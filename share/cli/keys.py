@@ -30,7 +30,8 @@ def keys() -> None:
 @keys.command(short_help="Generate this machine's key pair.")
 @click.option("--name", help="Name of the key pair.  [default: this machine's name]")
 @options.keys
-def generate(name: str | None, keys: Path | None) -> None:
+@options.as_json
+def generate(name: str | None, keys: Path | None, as_json: bool) -> None:
     """Generate this machine's key pair and print the public key.
 
     NAME.public may be copied anywhere; NAME.secret must stay on this machine. An existing pair is kept.
@@ -42,6 +43,9 @@ def generate(name: str | None, keys: Path | None) -> None:
 
     folder = _key_folder(keys)
     pair = make(folder, name)
+    if as_json:
+        click.echo(json.dumps({"folder": str(folder), "name": pair.name, "public_key": pair.public}))
+        return
     click.echo(f"{folder / pair.name}.public: give this key to the other machine:", err=True)
     click.echo(pair.public)
 

@@ -15,6 +15,7 @@ import click  # noqa: E402
 from share import __version__  # noqa: E402
 from share.cli.commands import CommandGroup  # noqa: E402
 from share.cli.stderr import flush_all  # noqa: E402
+from share.cli.verbosity import verbosity  # noqa: E402
 from share.errors import ShareError, one_line  # noqa: E402
 from share.runtime.signals import unwind_on_signal  # noqa: E402
 
@@ -60,10 +61,13 @@ def main(arguments: list[str] | None = None) -> None:
 
     arguments: those of the process if None.
     """
+    verbosity.begin()
     try:
         code = cli.main(arguments, prog_name="share", standalone_mode=False)
+        verbosity.summarise(__version__)
         sys.exit(code if isinstance(code, int) else 0)
     except ShareError as error:
+        verbosity.explain(error)
         _exit_with(str(error), error.exit_code)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.ctx.get_help() if error.ctx else "", err=True)

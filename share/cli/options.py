@@ -12,6 +12,7 @@ from unicodedata import normalize
 import click
 
 from share.cli.terminal import print_note
+from share.cli.verbosity import remember
 from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError, one_line
 
@@ -39,7 +40,7 @@ config = click.option(
     type=PATH,
     help="YAML file with settings (docs/lookup/configuration.md).",
 )
-verbose = click.option("-v", "--verbose", is_flag=True, help="Print more.")
+verbose = click.option("-v", "--verbose", is_flag=True, help="Print more.", callback=remember)
 keys = click.option(
     "--keys", metavar="DIR", type=PATH, help="Folder of this machine's keys.  [default: ~/.config/share/keys]"
 )

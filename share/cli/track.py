@@ -50,7 +50,7 @@ def track(
 ) -> None:
     """Track one agent without an edge: a recording as fast as possible, or a camera until Ctrl-C.
 
-    SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap or .db3 recording,
+    SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap or .db3 recording, a ROS bag,
     SESSION/NAME, or realsense[:SERIAL]. A recording gives the same poses every time, to the last digit. A
     frame without a pose has no line in T.tum.
 

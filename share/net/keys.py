@@ -237,6 +237,14 @@ def edge_keys(folder: Path | None) -> EdgeKeys:
 # ---------------------------------------------------------------- files
 
 
+def edge_keys_for(folder: Path | None, is_local: bool) -> EdgeKeys | None:
+    """Return the keys in `folder`, or those in the default folder if the edge is on a network (not
+    `is_local`); None if there are none. Raises UsageError."""
+    if folder is None and (is_local or not has_pair(default_folder())):
+        return None
+    return edge_keys(folder)
+
+
 def _parse_line(line: str, where: str) -> tuple[str, Grant]:
     """Return the key of a line and what it grants. Raises UsageError."""
     match = _LINE.fullmatch(line.strip())

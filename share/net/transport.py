@@ -117,11 +117,11 @@ class Address:
         return f"tcp://[{self.host}]:{self.port}" if ":" in self.host else f"tcp://{self.host}:{self.port}"
 
 
-_TCP = re.compile(r"tcp://(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_.-]+)):(\d{1,5})")
+_TCP = re.compile(r"(?:tcp://)?(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_.-]+)):(\d{1,5})")
 
 
 def parse_address(text: str, bind: bool = False) -> Address:
-    """Raises UsageError if `text` is not tcp://HOST:PORT (an IPv6 host in brackets)."""
+    """Return the address tcp://HOST:PORT or HOST:PORT (an IPv6 host in brackets). Raises UsageError."""
     match = _TCP.fullmatch(text)
     if not match or not (0 if bind else 1) <= int(match[3]) <= 65535:
         raise UsageError(

@@ -334,7 +334,17 @@ class InertialTracker:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)
         is_ready = self._keyframes.is_ready
-        return TrackResult(state, pose, is_ready, count, new_segment, cov, self._consistency.is_consistent)
+        return TrackResult(
+            state,
+            pose,
+            is_ready,
+            count,
+            new_segment,
+            cov,
+            self._consistency.is_consistent,
+            velocity=self._realignment.T_odom_filter[:3, :3] @ s.v,
+            angular_velocity=self._imu.rate.copy(),
+        )
 
     def _track_state(self, s: FilterState, count: int, imu: ImuUse) -> TrackState:
         has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)

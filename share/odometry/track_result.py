@@ -17,8 +17,9 @@ class TrackResult:
     inlier_count: features that the pose is based on. new_segment: odometry began anew before this frame. cov
     (6, 6): of T_odom_body, perturbed on the right, where the tracker knows it. is_consistent: False while
     images and IMU contradict each other. waiting_for: where there is no pose yet. found_count: features
-    found, outliers included. median_nis: over the features; 0 without any. The covariance is that of a frame
-    whose z axis is up as known now; `share.odometry.tilt_realignment` says how odom differs.
+    found, outliers included. median_nis: over the features; 0 without any. velocity (3,): of the body in
+    odom, m/s, and angular_velocity (3,): in the body, rad/s, where the tracker knows them. The covariance is
+    that of a frame whose z axis is up as known now; `share.odometry.tilt_realignment` says how odom differs.
     """
 
     state: TrackState
@@ -31,6 +32,8 @@ class TrackResult:
     waiting_for: WaitReason | None = None
     found_count: int = 0
     median_nis: float = 0.0
+    velocity: F64 | None = None
+    angular_velocity: F64 | None = None
 
 
 def finite_median(nis: F64) -> float:

@@ -207,7 +207,20 @@ class VisualTracker:
         state = TrackState.OK if count >= _WEAK_INLIERS else TrackState.WEAK
         found = self._all_found_tracks()
         result = TrackResult(state, self._T_odom_body(), wants_keyframe, count)
-        return replace(result, found_count=len(found.ids), median_nis=self._median_nis(found))
+        velocity, angular_velocity = self._body_velocity(T_odom_cam)
+        return replace(
+            result,
+            found_count=len(found.ids),
+            median_nis=self._median_nis(found),
+            velocity=velocity,
+            angular_velocity=angular_velocity,
+        )
+
+    def _body_velocity(self, T_odom_cam: F64) -> tuple[F64, F64]:
+        """Return the body's velocity (3,) in odom, m/s, and angular velocity (3,) in the body, rad/s, as the
+        mean since the last frame."""
+        twist = se3.adjoint(self._rig.T_body_cam0) @ self._velocity
+        return (T_odom_cam @ self._T_cam_body)[:3, :3] @ twist[3:], twist[:3]
 
     def _follow_tracks(self, image: U8, T_predicted: F64) -> _Tracks:
         assert self._image is not None

@@ -168,7 +168,8 @@ class Agent:
             self._finish_frame(frame, sent=False)
 
     def _publish_pose(self, frame: ev.FrameTracked, T_odom_body: F64) -> None:
-        self._effects.append(self._localisation.localise(frame, T_odom_body, self._now_ns))
+        drift_cov = self._self_evaluation.drift.cov
+        self._effects.append(self._localisation.localise(frame, T_odom_body, drift_cov, self._now_ns))
         if self._is_connected and self.makes_keyframes and self._pace.take_pose(self._now_ns):
             self._counts["poses"] += 1
             last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment

@@ -20,7 +20,8 @@ class FrameTracked:
 
     arrived_ns, done_ns: when the frame arrived and when its pose was known. is_keyframe: it becomes a
     keyframe and `KeyframeMade` follows. new_segment: odometry broke before it. error_cm: expected position
-    error; None without an error model. waiting_for: what the tracker needs before its first pose.
+    error; None without an error model. waiting_for: what the tracker needs before its first pose. cov,
+    velocity, angular_velocity: as in `TrackResult`.
     """
 
     index: int
@@ -33,6 +34,9 @@ class FrameTracked:
     new_segment: bool = False
     error_cm: float | None = None
     waiting_for: WaitReason | None = None
+    cov: F64 | None = None
+    velocity: F64 | None = None
+    angular_velocity: F64 | None = None
 
     @property
     def track_ms(self) -> float:
@@ -131,7 +135,11 @@ class FrameTrackedRemotely:
 @dataclass(frozen=True, eq=False)
 class LocalisedPose:
     """The agent's pose. arrived_ns: arrival of its frame. segment: number of the odometry segment, rising.
-    T_map_odom (4, 4): in force now; None before the first correction."""
+    T_map_odom (4, 4): in force now; None before the first correction.
+
+    cov, velocity, angular_velocity: as in `TrackResult`. map_cov (6, 6): of T_map_odom T_odom_body, perturbed
+    on the right; None before the first correction.
+    """
 
     index: int
     stamp_ns: int
@@ -141,6 +149,10 @@ class LocalisedPose:
     T_map_odom: F64 | None
     map_id: str | None
     state: TrackState
+    cov: F64 | None = None
+    velocity: F64 | None = None
+    angular_velocity: F64 | None = None
+    map_cov: F64 | None = None
 
 
 @dataclass(frozen=True)

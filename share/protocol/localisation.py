@@ -75,7 +75,12 @@ class MapFrame:
         correction."""
         if self._target is None:
             return 0.0
-        return 100 * position_sigma(compose_cov(T_odom_body, self._cov, np.zeros((6, 6))))
+        return 100 * position_sigma(self.cov(T_odom_body))
+
+    def cov(self, T_odom_body: F64) -> F64:
+        """Return the covariance (6, 6) of the body's pose in the map that is due to the newest correction,
+        perturbed on the right."""
+        return compose_cov(T_odom_body, self._cov, np.zeros((6, 6)))
 
     def apply(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
         """Set a new target. Return whether the pose jumps to it."""
@@ -124,15 +129,29 @@ class MapLocalisation:
         self.map_frame.reset()
         self._segment += 1
 
-    def localise(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> ev.LocalisedPose:
-        """Return the localised pose of a frame that has one. T_odom_body (4, 4)."""
+    def localise(
+        self, frame: ev.FrameTracked, T_odom_body: F64, drift_cov: F64, now_ns: int
+    ) -> ev.LocalisedPose:
+        """Return the localised pose of a frame that has one. T_odom_body (4, 4). drift_cov (6, 6): of
+        odometry since the newest correction."""
         self.T_odom_body = T_odom_body
         settled_s = self.map_frame.advance(T_odom_body, now_ns)
         if settled_s is not None:
             self.settle_s.append(settled_s)
         times = frame.index, frame.stamp_ns, frame.arrived_ns
         T_map_odom, map_id = self.map_frame.T_map_odom, self.map_frame.map_id
-        return ev.LocalisedPose(*times, self._segment, T_odom_body, T_map_odom, map_id, frame.state)
+        return ev.LocalisedPose(
+            *times,
+            self._segment,
+            T_odom_body,
+            T_map_odom,
+            map_id,
+            frame.state,
+            frame.cov,
+            frame.velocity,
+            frame.angular_velocity,
+            None if T_map_odom is None else self.map_frame.cov(T_odom_body) + drift_cov,
+        )
 
     def apply_correction(
         self, correction: Correction, entry: LedgerEntry | None, corrected_ms: float | None, now_ns: int
@@ -210,9 +229,11 @@ class DriftEstimator:
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self._motions: deque[tuple[int, int, F64, F64]] = deque()  # keyframe id, time, T_last_this, cov
+        self._cov: F64 | None = None  # of them all, once it is asked for
 
     def add_keyframe(self, keyframe: Keyframe, sent_ns: int) -> None:
         """Add a sent keyframe. One without a reference starts a segment with zero drift."""
+        self._cov = None
         if keyframe.reference < 0 or self._since_ns is None:
             self._motions.clear()
             self._since_ns = sent_ns
@@ -225,6 +246,7 @@ class DriftEstimator:
 
     def correct(self, keyframe: int) -> None:
         """Drop the drift up to this keyframe, which a correction answers."""
+        self._cov = None
         while self._motions and self._motions[0][0] <= keyframe:
             self._since_ns = self._motions.popleft()[1]
 
@@ -238,7 +260,14 @@ class DriftEstimator:
             return None
         if local_cm is not None:
             return local_cm * math.sqrt(min(1.0, max(0, now_ns - self._since_ns) / seconds_to_ns(WINDOW_S)))
-        cov = np.zeros((6, 6))
-        for _, _, T, added_cov in self._motions:
-            cov = compose_cov(T, cov, added_cov)
-        return 100 * position_sigma(cov)
+        return 100 * position_sigma(self.cov)
+
+    @property
+    def cov(self) -> F64:
+        """The covariance (6, 6) of odometry from the newest keyframe that a correction answered to the newest
+        sent one, perturbed on the right."""
+        if self._cov is None:
+            self._cov = np.zeros((6, 6))
+            for _, _, T, added_cov in self._motions:
+                self._cov = compose_cov(T, self._cov, added_cov)
+        return self._cov

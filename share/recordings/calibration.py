@@ -33,6 +33,12 @@ _NOISE_KEYS = {
     "accel_density": "accelerometer_noise_density",
     "accel_walk": "accelerometer_random_walk",
 }
+DEFAULT_TOPICS = {  # of our MCAP recordings (`share.recordings.mcap.ros_messages.TOPICS`), by section
+    "cam0": "/cam0/image_raw",
+    "cam1": "/cam1/image_raw",
+    "depth": "/depth/image_raw",
+    "imu0": "/imu0",
+}
 TIMESHIFT = "timeshift_cam_imu"
 SERIAL = "serial"
 _MAX_TIMESHIFT_SPREAD_S = 1e-3  # between the timeshifts of synchronised cameras
@@ -278,10 +284,12 @@ def to_kalibr(rig: Rig, original: Calibration | None = None, serial: str | None 
     T_imu_cam0, shift_s = (
         (original.T_imu_cam0, original.timeshift_s) if rig.imu is None else (rig.T_body_cam0, rig.timeshift_s)
     )
-    shift = {TIMESHIFT: shift_s} if shift_s else {}  # absent means 0
+    shift: dict[str, Any] = {TIMESHIFT: shift_s} if shift_s else {}  # absent means 0
     out = {"cam0": _kalibr_camera(rig.cam0) | shift}
     if T_imu_cam0 is not None:
         out["cam0"]["T_cam_imu"] = se3.inverse(T_imu_cam0).tolist()
+        if rig.T_cam1_cam0 is not None:
+            shift["T_cam_imu"] = (rig.T_cam1_cam0 @ se3.inverse(T_imu_cam0)).tolist()
     if rig.imu is not None:
         out["imu0"] = _kalibr_imu(rig.imu)
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
@@ -305,15 +313,30 @@ def kalibr_texts(rig: Rig, remark: str, serial: str | None = None) -> dict[str, 
     parts = {CAMCHAIN: {k: v for k, v in data.items() if k != "imu0"}}
     if "imu0" in data:
         parts[IMU_CHAIN] = {"imu0": data["imu0"]}
-    return {name: f"# {remark}\n" + _yaml_text(part) for name, part in parts.items()}
+    return {name: kalibr_text(part, remark) for name, part in parts.items()}
+
+
+def kalibr_text(chain: dict[str, Any], *remarks: str) -> str:
+    """Return the text of a chain of `to_kalibr` that Kalibr, OpenVINS and OpenCV's FileStorage read.
+
+    remarks: comment lines for the top. Kalibr's own files always have a topic, and a timeshift where there
+    is an IMU. OpenCV wants the directive of the first line, and lists further in than their key.
+    """
+    sections = {}
+    for name, section in chain.items():
+        topic = {"rostopic": DEFAULT_TOPICS[name]} if "rostopic" not in section else {}
+        shift = {TIMESHIFT: 0.0} if "T_cam_imu" in section and TIMESHIFT not in section else {}
+        sections[name] = section | shift | topic
+    lines = ["%YAML 1.0", "---", *(f"# {remark}" for remark in remarks)]
+    return "\n".join(lines) + "\n" + _yaml_text(sections)
 
 
 def asl_camera_text(camera: Camera, T_bs: F64, rate_hz: float) -> str:
     """Return the text of a camera's sensor.yaml in an ASL folder. T_bs (4, 4): its pose in the IMU."""
     values = _kalibr_camera(camera)
+    values["distortion_coefficients"] = values.pop("distortion_coeffs")
     if camera.distortion:
         values["distortion_model"] = EQUIDISTANT if camera.is_fisheye else "radial-tangential"
-        values["distortion_coefficients"] = values.pop("distortion_coeffs")
     return _asl_text("camera", T_bs, {"rate_hz": rate_hz} | values)
 
 
@@ -331,19 +354,20 @@ def _asl_text(kind: str, T_bs: F64, values: dict[str, Any]) -> str:
 def _yaml_text(values: dict[str, Any]) -> str:
     import yaml
 
-    return str(yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
+    class IndentedLists(yaml.SafeDumper):
+        def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
+            super().increase_indent(flow, False)
+
+    dumped = yaml.dump(values, Dumper=IndentedLists, sort_keys=False, default_flow_style=None, width=1000)
+    return str(dumped)
 
 
 def _kalibr_camera(camera: Camera) -> dict[str, Any]:
-    distortion = (
-        {"distortion_model": camera.model, "distortion_coeffs": list(camera.distortion)}
-        if camera.distortion
-        else {"distortion_model": "none"}
-    )
     return {
         "camera_model": "pinhole",
         "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        **distortion,
+        "distortion_model": camera.model if camera.distortion else "none",
+        "distortion_coeffs": list(camera.distortion),
         "resolution": [camera.width, camera.height],
     }
 

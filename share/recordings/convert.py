@@ -50,7 +50,7 @@ def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progr
     check_replaceable(out)
     try:
         with Recorder(out, source.rig, jpeg, serial=source.serial) as recorder:
-            for measurement in _intact_measurements(source, progress):
+            for measurement in intact_measurements(source, progress):
                 recorder.write(measurement)
     except BaseException:  # also Ctrl-C
         out.with_name(out.name + ".part").unlink(missing_ok=True)
@@ -69,7 +69,7 @@ def to_euroc(source: Source, out: Path, progress: Progress) -> None:
         _write_asl(source, work / "mav0", progress)
 
 
-def _intact_measurements(source: Source, progress: Progress) -> Iterator[Measurement]:
+def intact_measurements(source: Source, progress: Progress) -> Iterator[Measurement]:
     """Yield all measurements except damaged images. The first images of each camera are decoded until one is
     intact, to find a wrong size early."""
     verified = set()
@@ -105,7 +105,7 @@ def _write_asl(source: Source, root: Path, progress: Progress) -> None:
         (root / "imu0").mkdir()
         (root / "imu0" / "sensor.yaml").write_text(asl_imu_text(rig.imu))
         listings["imu0"] = ["#timestamp [ns],w_x,w_y,w_z [rad s^-1],a_x,a_y,a_z [m s^-2]"]
-    for m in _intact_measurements(source, progress):
+    for m in intact_measurements(source, progress):
         if m.stream == IMU:
             listings["imu0"].append(f"{m.stamp_ns},{_numbers(m.payload)}")
         else:

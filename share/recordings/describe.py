@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from share.geometry.camera import Camera, Rig
+from share.recordings.bags.message_file import MessageFile
 from share.recordings.recording import Source
 from share.sensors.stamps import GAP_FACTOR
 from share.types import I64
@@ -27,6 +28,28 @@ def describe_recording(source: Source) -> dict[str, Any]:
         "calibration": describe_rig(source.rig),
         "truth": _truth(source),
         "notes": [*source.notes, *source.losses.lines()],
+    }
+
+
+def describe_messages(file: MessageFile, why: str) -> dict[str, Any]:
+    """Return the topics of a file of ROS messages, with counts, rates and gaps by their log times, where it
+    cannot be opened as a recording. why: the reason, such as a missing calibration."""
+    times = {name: stamps for name, stamps in file.log_times.items() if len(stamps)}
+    first = min((int(stamps[0]) for stamps in times.values()), default=0)
+    last = max((int(stamps[-1]) for stamps in times.values()), default=0)
+    return {
+        "name": file.path.resolve().stem,
+        "kind": "messages",
+        "serial": None,
+        "duration_s": (last - first) / 1e9,
+        "start_ns": first,
+        "topics": {
+            name: {"type": file.topics[name].kind, **describe_stream(stamps)}
+            for name, stamps in sorted(times.items())
+        },
+        "calibration": None,
+        "truth": None,
+        "notes": [why],
     }
 
 

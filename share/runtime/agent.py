@@ -18,7 +18,7 @@ import dataclasses
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,7 @@ from share.runtime.frame_consumers import FrameConsumer, LocalTracking, RemoteTr
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.output_writer import OutputWriter
 from share.runtime.pipeline import check_trackable, read_frames
-from share.runtime.pose_feed import PoseFeed
+from share.runtime.pose import PoseSink, localised_pose
 from share.runtime.run_files import AgentFiles, BackgroundLines
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
@@ -99,9 +99,10 @@ class AgentRun:
         show: Callable[[LiveStatus], None] = lambda status: None,
         verbose: bool = False,
         error_estimator: ErrorEstimator | None = None,
-        pose_feed: PoseFeed | None = None,
+        pose_sinks: Sequence[PoseSink] = (),
     ) -> None:
-        """error_estimator: estimates the tracking error of keyframes. pose_feed: publishes poses by UDP."""
+        """error_estimator: estimates the tracking error of keyframes. pose_sinks: get every
+        pose, and are closed at the end."""
         self._source, self._settings = source, settings
         self._notify, self._show, self._verbose = notify, show, verbose
         self._guard = FaultGuard(notify)
@@ -116,7 +117,7 @@ class AgentRun:
             if hello.streams_frames
             else LocalTracking(source, settings, self._guard, estimator, self._log, notify)
         )
-        self._pose_feed = pose_feed
+        self._pose_sinks = pose_sinks
         self._late_dropper = LateFrameDropper(settings.agent.late_ms)
         self._lateness_monitor = LatenessMonitor(notify, self._consumer.bottleneck)
         self._counters = SequencerCounters()
@@ -150,8 +151,8 @@ class AgentRun:
             self._shared.closed.set()
             self._output_writer.submit(self._files.release)
             self._link.close()
-            if self._pose_feed is not None:
-                self._pose_feed.close()
+            for sink in self._pose_sinks:
+                sink.close()
             tracker.join(timeout=4)
             self._consumer.close(self._output_writer.submit)
             self._output_writer.stop()
@@ -270,8 +271,9 @@ class AgentRun:
             case ev.LocalisedPose():
                 self._publish_pose(effect)
             case ev.FrameDone():
-                if self._pose_feed is not None and not effect.state.has_pose:
-                    self._pose_feed.publish(effect.stamp_ns, effect.state)
+                if not effect.state.has_pose:
+                    for sink in self._pose_sinks:
+                        sink.publish_state(effect.stamp_ns, effect.state)
                 self._lateness_monitor.record(effect.track_ms)
                 self._log.add(
                     effect.stamp_ns, effect.track_ms, effect.state, effect.is_keyframe, effect.is_sent
@@ -293,34 +295,20 @@ class AgentRun:
                 self._ended = True
 
     def _publish_pose(self, localised: ev.LocalisedPose) -> None:
-        T_map_body = (
-            None
-            if localised.T_map_odom is None or localised.map_id is None
-            else localised.T_map_odom @ localised.T_odom_body
-        )
-        if self._pose_feed is not None:  # first: its delay matters
-            age_ms = (time.monotonic_ns() - localised.arrived_ns) / 1e6
-            self._pose_feed.publish(
-                localised.stamp_ns,
-                localised.state,
-                age_ms,
-                localised.segment,
-                localised.T_odom_body,
-                T_map_body,
-                localised.map_id,
-            )
-        self._output_writer.submit(
-            partial(self._files.write_odom_pose, localised.stamp_ns, localised.T_odom_body)
-        )
-        if T_map_body is not None and localised.map_id is not None:
+        pose = localised_pose(localised, (time.monotonic_ns() - localised.arrived_ns) / 1e6)
+        for sink in self._pose_sinks:  # first: their delay matters
+            sink.publish(pose)
+        self._output_writer.submit(partial(self._files.write_odom_pose, pose.stamp_ns, pose.T_odom_body))
+        if pose.T_map_body is not None and pose.map_id is not None:
             self._output_writer.submit(
-                partial(self._files.write_map_pose, localised.stamp_ns, T_map_body, localised.map_id)
+                partial(self._files.write_map_pose, pose.stamp_ns, pose.T_map_body, pose.map_id)
             )
 
     def _show_idle(self, event: ev.StatusReport) -> None:
         """Publish and show that the last pose is stale; no frame reports this."""
-        if self._pose_feed is not None and event.stamp_ns is not None:
-            self._pose_feed.publish(event.stamp_ns, event.status.state, event.status.pose_age_ms)
+        for sink in self._pose_sinks:
+            if event.stamp_ns is not None:
+                sink.publish_state(event.stamp_ns, event.status.state, event.status.pose_age_ms)
         self._show_status(event.status, idle=True)
 
     def _show_status(self, status: m.Status, idle: bool = False) -> None:

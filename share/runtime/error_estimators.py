@@ -14,7 +14,7 @@ from share.metrics.frame_log import summary
 from share.metrics.local_error import LocalError
 from share.odometry.error_model.history import FrameOutcome, MotionHistory, RecentMotion
 from share.odometry.error_model.inputs import error_model_input
-from share.odometry.error_model.network import ErrorEstimate, OnnxSession, estimate_error
+from share.odometry.error_model.network import ErrorEstimate, OnnxSession, estimate_error, open_error_model
 from share.odometry.track_result import TrackResult
 from share.timing import RingBuffer
 from share.types import U8, FeatureStatistics, Frame, KeyframeCandidate
@@ -166,3 +166,8 @@ class BackgroundErrorModel(SynchronousErrorModel):
             self._wake.wait_for(lambda: self._is_closed or self._pending_job is not None)
             job, self._pending_job = self._pending_job, None
             return None if self._is_closed else job
+
+
+def model_estimator(error_model: str, notify: Callable[[str], None]) -> BackgroundErrorModel | None:
+    """Return the error model `shipped` or of a file, running in a thread; None for "". Raises DataError."""
+    return BackgroundErrorModel(open_error_model(error_model), notify) if error_model else None

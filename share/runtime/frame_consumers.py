@@ -84,6 +84,9 @@ class LocalTracking(FrameConsumer):
             new_segment=result.new_segment,
             error_cm=self._estimate_error_cm(frame, result),
             waiting_for=result.waiting_for,
+            cov=result.cov,
+            velocity=result.velocity,
+            angular_velocity=result.angular_velocity,
         )
         post(tracked)  # before keyframe work: the pose must not wait for it
         self._log.add_result(result.new_segment, result.is_consistent, result.waiting_for)

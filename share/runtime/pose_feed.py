@@ -1,6 +1,7 @@
-"""Live poses for another program: one UDP datagram of JSON per frame (docs/do/integrate.md).
+"""Live poses for another program, JSON of one frame in each message (docs/do/integrate.md).
 
-No receiver is needed, and a slow one cannot delay the agent: lost datagrams are not resent.
+By UDP to one address: no receiver is needed, and a slow one cannot delay the agent, as lost datagrams are
+not resent. By WebSocket to all that connect: each gets the newest message that it has time for.
 """
 
 from __future__ import annotations
@@ -8,45 +9,80 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+from collections.abc import Sequence
 from typing import Any
 
-from share.errors import UsageError
+import numpy as np
+
+from share.errors import ShareError, UsageError
 from share.geometry.se3 import quat_from_matrix
 from share.net.udp import HostPort, parse_host, resolve
-from share.types import F64
+from share.runtime.pose import Pose, PoseSink
+from share.types import F64, TrackState
 
-SCHEMA = 2
-_SCHEME = "udp://"
-_DEFAULT_PORT = 5570
+SCHEMA = 3  # 3: velocity, covariances; all keys of 2 are as they were
+DEFAULT_PORT = 5570
+UDP, WEBSOCKET = "udp://", "ws://"
 _DIGITS = 9  # 1 nm
+_UPPER = np.triu_indices(6)
+_ROS_ORDER = [3, 4, 5, 0, 1, 2]  # translation before rotation
 
 
 class PoseFeed:
-    """Sends poses to one address. Raises UsageError for a malformed address or an unknown host."""
+    """Sends poses to one address by UDP. Raises UsageError for a malformed address or an unknown host."""
 
     def __init__(self, address: str, agent: str) -> None:
-        if not address.startswith(_SCHEME):
+        if not address.startswith(UDP):
             raise UsageError(
-                f"--poses {address}: expected udp://HOST:PORT, such as udp://127.0.0.1:{_DEFAULT_PORT}"
+                f"--poses {address}: expected udp://HOST:PORT or ws://HOST:PORT, "
+                f"such as udp://127.0.0.1:{DEFAULT_PORT}"
             )
-        self.host: HostPort = parse_host(address.removeprefix(_SCHEME), _DEFAULT_PORT)
+        self.host: HostPort = parse_host(address.removeprefix(UDP), DEFAULT_PORT)
         family, self._target = resolve(self.host)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._messages = PoseMessages(agent)
+
+    def publish(self, pose: Pose) -> None:
+        self._send(self._messages.of_pose(pose))
+
+    def publish_state(self, stamp_ns: int, state: TrackState, age_ms: float | None = None) -> None:
+        self._send(self._messages.of_state(stamp_ns, state, age_ms))
+
+    def _send(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # no network, a full buffer: the next one is newer
+            self._socket.sendto(text.encode(), self._target)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class PoseMessages:
+    """Numbers an agent's poses and writes them as JSON."""
+
+    def __init__(self, agent: str) -> None:
         self._agent, self._sequence = agent, 0
 
-    def publish(
+    def of_pose(self, pose: Pose) -> str:
+        odom = _pose_fields(pose.T_odom_body, pose.cov)
+        odom |= {"velocity": _rounded(pose.velocity), "angular_velocity": _rounded(pose.angular_velocity)}
+        in_map = None if pose.T_map_body is None else _pose_fields(pose.T_map_body, pose.map_cov)
+        return self._message(pose.stamp_ns, pose.state, pose.age_ms, pose.segment, odom, in_map, pose.map_id)
+
+    def of_state(self, stamp_ns: int, state: TrackState, age_ms: float | None = None) -> str:
+        """Return the message of a frame without a pose."""
+        return self._message(stamp_ns, state, age_ms)
+
+    def _message(
         self,
         stamp_ns: int,
         state: str,
-        age_ms: float | None = None,
+        age_ms: float | None,
         segment: int | None = None,
-        T_odom_body: F64 | None = None,
-        T_map_body: F64 | None = None,
+        odom: dict[str, Any] | None = None,
+        in_map: dict[str, Any] | None = None,
         map_id: str | None = None,
-    ) -> None:
-        """Send one frame's pose. age_ms: time since it arrived in this process. segment: of odometry. Poses
-        (4, 4), None where unknown."""
+    ) -> str:
         message = {
             "schema": SCHEMA,
             "agent": self._agent,
@@ -55,20 +91,62 @@ class PoseFeed:
             "age_ms": None if age_ms is None else round(age_ms, 3),
             "state": state,
             "segment": segment,
-            "odom": _pose_fields(T_odom_body),
-            "map": _pose_fields(T_map_body),
-            "map_id": None if T_map_body is None else map_id,
+            "odom": odom,
+            "map": in_map,
+            "map_id": map_id,
         }
         self._sequence += 1
-        with contextlib.suppress(OSError):  # no network, a full buffer: the next one is newer
-            self._socket.sendto(json.dumps(message).encode(), self._target)
-
-    def close(self) -> None:
-        self._socket.close()
+        return json.dumps(message, separators=(",", ":"))
 
 
-def _pose_fields(T: F64 | None) -> dict[str, Any] | None:
-    if T is None:
-        return None
+def open_pose_sinks(addresses: Sequence[str], agent: str, origins: Sequence[str] = ()) -> list[PoseSink]:
+    """Return what sends poses by UDP to each udp:// address, or serves them at each ws:// one.
+
+    origins: web pages that may read the latter. Raises UsageError, ShareError without the extra for
+    WebSocket, TransportError if a port is in use.
+    """
+    if origins and not any(address.startswith(WEBSOCKET) for address in addresses):
+        raise UsageError("--poses-origin works only with --poses ws://HOST:PORT; leave it out")
+    sinks: list[PoseSink] = []
+    try:
+        for address in addresses:
+            sinks.append(_open_pose_sink(address, agent, origins))
+    except ShareError:
+        for sink in sinks:
+            sink.close()
+        raise
+    return sinks
+
+
+def _open_pose_sink(address: str, agent: str, origins: Sequence[str]) -> PoseSink:
+    if not address.startswith(WEBSOCKET):
+        return PoseFeed(address, agent)
+    from share.runtime.pose_websocket import PoseWebSocket
+
+    return PoseWebSocket(address, agent, origins)
+
+
+def _pose_fields(T: F64, cov: F64 | None) -> dict[str, Any]:
     position, rotation = T[:3, 3].round(_DIGITS).tolist(), quat_from_matrix(T[:3, :3]).round(_DIGITS).tolist()
-    return {"position": position, "quaternion": rotation}
+    covariance = None if cov is None else _upper_triangle(fixed_axes_cov(T, cov))
+    return {"position": position, "quaternion": rotation, "covariance": covariance}
+
+
+def fixed_axes_cov(T: F64, cov: F64) -> F64:
+    """Return a covariance (6, 6) in ROS's form (geometry_msgs/PoseWithCovariance): translation before
+    rotation, both about the axes of the frame in which the pose `T` (4, 4) is given.
+
+    cov (6, 6): of `T`, rotation before translation, perturbed on the right.
+    """
+    R = np.kron(np.eye(2), T[:3, :3])
+    out: F64 = (R @ cov @ R.T)[np.ix_(_ROS_ORDER, _ROS_ORDER)]
+    return out
+
+
+def _upper_triangle(cov: F64) -> list[float]:
+    """Return the 21 numbers on and above the diagonal, row by row, with four digits."""
+    return [float(f"{value:.3e}") for value in cov[_UPPER].tolist()]
+
+
+def _rounded(vector: F64 | None) -> list[float] | None:
+    return None if vector is None else [round(value, 6) for value in vector.tolist()]

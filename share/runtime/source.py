@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from share.cameras.realsense.devices import is_camera
 from share.errors import UsageError
+from share.recordings.bags import METADATA
 from share.recordings.calibration import Calibration, read_calibration
 from share.recordings.folders import is_euroc, is_tum, open_euroc, open_tum
 from share.recordings.recording import Source
@@ -29,6 +29,14 @@ def _open_mcap(path: Path, calibration: Calibration | None, frames: slice | None
     from share.recordings.mcap.reader import open_mcap  # imports rosbags and mcap only when needed
 
     return open_mcap(path, calibration, frames)
+
+
+def _is_bag(path: Path) -> bool:
+    if not (path.suffix in (".db3", ".bag") or (path / METADATA).is_file()):
+        return False
+    from share.recordings.bags.message_file import is_bag
+
+    return is_bag(path)
 
 
 def _is_mcap(path: Path) -> bool:
@@ -58,6 +66,7 @@ def _is_db3(path: Path) -> bool:
 READERS = (
     Reader("SESSION/NAME (a folder with session.yaml)", _is_session_agent, _open_session_agent),
     Reader("an MCAP recording (.mcap)", _is_mcap, _open_mcap),
+    Reader("a ROS 2 bag (a folder with metadata.yaml, or .db3) or a ROS 1 bag (.bag)", _is_bag, _open_mcap),
     Reader("a recording of the RealSense SDK (.db3)", _is_db3, _open_db3),
     Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
     Reader("a TUM RGB-D folder (rgb.txt, depth.txt, camera.yaml)", is_tum, open_tum),
@@ -83,21 +92,8 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
     if is_session(path):
         agents = ", ".join(str(path / name) for name in read_session(path).agents)
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
-    if path.suffix == ".bag" or (path / "metadata.yaml").is_file():
-        raise UsageError(f"{spec}: is a ROS bag; {_bag_advice(path)}")
     known = "; ".join(reader.description for reader in READERS)
     raise UsageError(f"{spec}: not a recording that SHARE reads: {known}")
-
-
-def _bag_advice(path: Path) -> str:
-    """Return how to read a ROS bag: a file of ROS 1, or a folder of ROS 2."""
-    if files := sorted(path.glob("*.mcap")):
-        return f"give its file {files[0]}"
-    folder = path.with_name(f"{path.stem}-mcap")
-    command = shlex.join(
-        ["rosbags-convert", "--src", f"{path}", "--dst", f"{folder}", "--dst-storage", "mcap"]
-    )
-    return f"convert it with `{command}`, then give {folder / folder.name}.mcap (and --calib)"
 
 
 def read_given_calibration(calib: str | None) -> Calibration | None:

@@ -83,25 +83,48 @@ def sequence_frames(
     Streams may be out of step by up to imu_silent_ms, and out of order within themselves by reorder_ms,
     without any effect on the frames. Memory is bounded by these times.
     """
-    repair = StampRepair()
-    merger = FrameMerger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
+    sequencer = FrameSequencer(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
     for measurement in measurements:
-        if measurement.stream in merger.buffers:
-            for stamp, usable in repair.feed(measurement):
-                merger.add(usable.stream, stamp, usable.payload)
-                yield from merger.ready_frames()
-        _update_counters(repair, counters, merger)
-    for stamp, usable in repair.flush():
-        merger.add(usable.stream, stamp, usable.payload)
-        yield from merger.ready_frames()
-    merger.finish()
-    yield from merger.ready_frames()
-    _update_counters(repair, counters, merger)
+        yield from sequencer.feed(measurement)
+    yield from sequencer.finish()
 
 
-def _update_counters(repair: StampRepair, counters: SequencerCounters, merger: FrameMerger) -> None:
-    counters.wraps, counters.jumps, counters.strays = repair.wraps, repair.jumps, repair.strays
-    counters.backward = merger.backward + repair.past
+class FrameSequencer:
+    """`sequence_frames`, one measurement at a time."""
+
+    def __init__(
+        self,
+        streams: Collection[str],
+        rate_hz: float,
+        config: SequencerConfig,
+        counters: SequencerCounters,
+        imu_shift_ns: int = 0,
+        imu_range: ImuRange = _DEFAULT_IMU_RANGE,
+    ) -> None:
+        self._counters, self._repair = counters, StampRepair()
+        self._merger = FrameMerger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
+
+    def feed(self, measurement: Measurement) -> Iterator[UndecodedFrame]:
+        """Add a measurement; yield the frames that are complete now."""
+        if measurement.stream in self._merger.buffers:
+            for stamp, usable in self._repair.feed(measurement):
+                self._merger.add(usable.stream, stamp, usable.payload)
+                yield from self._merger.ready_frames()
+        self._update_counters()
+
+    def finish(self) -> Iterator[UndecodedFrame]:
+        """Yield the frames that still wait: nothing follows."""
+        for stamp, usable in self._repair.flush():
+            self._merger.add(usable.stream, stamp, usable.payload)
+            yield from self._merger.ready_frames()
+        self._merger.finish()
+        yield from self._merger.ready_frames()
+        self._update_counters()
+
+    def _update_counters(self) -> None:
+        repair, counters = self._repair, self._counters
+        counters.wraps, counters.jumps, counters.strays = repair.wraps, repair.jumps, repair.strays
+        counters.backward = self._merger.backward + repair.past
 
 
 class _Buffer:

@@ -17,14 +17,10 @@ from share.files.writing import atomic_write, new_folder, open_new, write_errors
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
+from share.recordings.exports.scene import COLOURS, known_points
 from share.recordings.trajectory import Trajectory, format_tum
 from share.store.map_store import MapStore
 from share.types import F64
-
-COLOURS: tuple[Colour, ...] = (  # matplotlib's tab10: one per run, in order of arrival
-    (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189),
-    (140, 86, 75), (227, 119, 194), (127, 127, 127), (188, 189, 34), (23, 190, 207),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,9 +103,8 @@ def _point_clouds(
     }
     for keyframe in keyframes:
         T_body_cam0, colour = runs[keyframe.run_key]
-        points = keyframe.keyframe.points.astype(np.float64)
-        known = points[~np.isnan(points).any(1)]
-        yield se3.transform(T[keyframe.keyframe_key] @ T_body_cam0, known), colour
+        points = known_points(keyframe.keyframe.points)
+        yield se3.transform(T[keyframe.keyframe_key] @ T_body_cam0, points), colour
         progress(1)
 
 

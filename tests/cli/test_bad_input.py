@@ -550,7 +550,7 @@ def wait_for(what: Callable[[], bool]) -> None:
 @pytest.mark.parametrize(
     "address",
     [
-        *("", "localhost", "tcp://", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://127.0.0.1:port"),
+        *("", "localhost", "tcp://", "127.0.0.1", "tcp://127.0.0.1", "tcp://127.0.0.1:port"),
         *("tcp://h:65536", "udp://127.0.0.1:5555", "tcp://a b:1", "tcp://::1:5555", "tcp://h:1:2"),
     ],
 )

@@ -247,7 +247,7 @@ def test_an_address_in_use_is_reported(net: Net) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "127.0.0.1:5555", "tcp://:5", "tcp://h", "tcp://h:x", "tcp://h:70000", "udp://h:5", "tcp://h:0"],
+    ["", "127.0.0.1", "tcp://:5", "tcp://h", "tcp://h:x", "tcp://h:70000", "udp://h:5", "tcp://h:0"],
 )
 def test_malformed_addresses(text: str) -> None:
     with pytest.raises(UsageError, match="is not an address; expected tcp://HOST:PORT"):
@@ -316,3 +316,9 @@ def test_bytes_that_are_not_zeromq_do_no_harm() -> None:
         eventually(lambda: agent.send([b"fine"]))
         assert eventually(lambda: heard(edge)) == (peer_id(2), [b"fine"])
         raw.close()
+
+
+def test_an_address_needs_no_scheme():
+    assert parse_address("192.168.1.10:5555") == parse_address("tcp://192.168.1.10:5555")
+    assert str(parse_address("[::1]:5555")) == "tcp://[::1]:5555"
+    assert parse_address("localhost:0", bind=True).local

@@ -123,7 +123,9 @@ def test_rosbags_reads_it_as_ros_2(folder, tmp_path):
         seen = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
     n = source.images_count
     assert kinds["/cam0/image_raw/compressed"] == ("sensor_msgs/msg/CompressedImage", n)
-    assert kinds["/cam0/camera_info"] == ("sensor_msgs/msg/CameraInfo", 1)
+    assert kinds["/cam0/camera_info"] == ("sensor_msgs/msg/CameraInfo", n)
+    infos = [message.header for topic, message in seen if topic == "/cam0/camera_info"]
+    assert infos == [message.header for topic, message in seen if topic == "/cam0/image_raw/compressed"]
     assert kinds["/tf_static"] == ("tf2_msgs/msg/TFMessage", 1)
     if source.rig.imu:
         first = next(m for topic, m in seen if topic == "/imu0")

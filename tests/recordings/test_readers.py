@@ -264,22 +264,6 @@ def test_other_folders_and_files_are_refused(tmp_path):
         open_source(str(tmp_path))
 
 
-def test_ros_bags_are_refused_with_the_way_to_read_them(tmp_path):
-    old, new = tmp_path / "a walk.bag", tmp_path / "bag2"
-    old.write_bytes(b"#ROSBAG V2.0\n")
-    new.mkdir()
-    (new / "metadata.yaml").touch()
-    for bag, quoted, name in ((old, f"'{old}'", "a walk-mcap"), (new, str(new), "bag2-mcap")):
-        with pytest.raises(UsageError) as refused:
-            open_source(str(bag))
-        said = str(refused.value)
-        assert f"is a ROS bag; convert it with `rosbags-convert --src {quoted} --dst" in said
-        assert f"then give {tmp_path / name / name}.mcap (and --calib)" in said
-    (new / "bag2_0.mcap").touch()
-    with pytest.raises(UsageError, match=r"is a ROS bag; give its file .*bag2/bag2_0\.mcap$"):
-        open_source(str(new))
-
-
 @pytest.mark.long
 def test_real_recordings(shared_data):
     euroc = open_source(str(shared_data / "real" / "euroc_v1_01_keyframes"))

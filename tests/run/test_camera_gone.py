@@ -50,7 +50,7 @@ def test_a_disconnected_camera_is_reported_everywhere_within_a_second(
     feed = PoseFeed(f"udp://127.0.0.1:{udp.getsockname()[1]}", "ann")
     run = AgentRun(
         source, hello, Config(), lambda: connect(address, 77), None, said.append,
-        lambda status: lines.append(status.state), pose_feed=feed,
+        lambda status: lines.append(status.state), pose_sinks=[feed],
     )  # fmt: skip
     thread = threading.Thread(target=run.run, daemon=True)
 

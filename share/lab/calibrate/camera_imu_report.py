@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
@@ -18,7 +17,7 @@ from share.lab.calibrate.camera_report import RigUncertainty
 from share.lab.calibrate.corners import inlier_mask
 from share.lab.calibrate.report import AXIS_COLOURS, chain_heading
 from share.lab.evaluate.charts import agg_pyplot, save_png
-from share.recordings.calibration import Calibration, to_kalibr
+from share.recordings.calibration import Calibration, kalibr_text, to_kalibr
 from share.types import F64, I64
 
 
@@ -105,14 +104,13 @@ def camchain_yaml(outcome: CameraImuCalibration, source: str, report: str) -> st
     for cam, T in enumerate(outcome.T_cam_imu):
         chain[f"cam{cam}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
     heading = chain_heading("camera-imu", source, outcome.verdict.passed, report)
-    heading += "# t_imu = t_cam + timeshift_cam_imu\n"
-    return heading + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+    return kalibr_text(chain, heading, "t_imu = t_cam + timeshift_cam_imu")
 
 
 def imu_chain_yaml(outcome: CameraImuCalibration, source: str) -> str:
     """Return the IMU's noise as the recording states it, so that the folder is complete."""
     chain = {"imu0": to_kalibr(outcome.calibrated_rig, serial=outcome.serial)["imu0"]}
-    return f"# unchanged by share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
+    return kalibr_text(chain, f"unchanged by share calibrate camera-imu {source}")
 
 
 def report_values(outcome: CameraImuCalibration) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from share.errors import ConfigError, DataError
 from share.files.json_file import read_json
@@ -25,7 +24,7 @@ from share.lab.calibrate.corners import inlier_mask, model_radius
 from share.lab.calibrate.report import AXIS_COLOURS, chain_heading, failed_path
 from share.lab.calibrate.target import Target, read_target
 from share.lab.evaluate.charts import agg_pyplot, save_png
-from share.recordings.calibration import Calibration, imu_noise, to_kalibr
+from share.recordings.calibration import Calibration, imu_noise, kalibr_text, to_kalibr
 from share.types import F64
 
 REPORT, PICTURE = "camera-report.json", "camera-report.png"
@@ -82,11 +81,8 @@ def camchain_yaml(outcome: CameraCalibration, source: str, report: str) -> str:
     """Return the camchain, with the given extrinsics to the IMU. report: as for `chain_heading`."""
     kalibr = to_kalibr(outcome.rig, outcome.given_calibration, outcome.serial)
     chain = {key: value for key, value in kalibr.items() if key != "imu0"}
-    if "T_cam_imu" in chain["cam0"] and "cam1" in chain:  # by the new pair
-        T_cam1_cam0 = np.array(chain["cam1"]["T_cn_cnm1"])
-        chain["cam1"]["T_cam_imu"] = (T_cam1_cam0 @ chain["cam0"]["T_cam_imu"]).tolist()
     heading = chain_heading("camera", source, outcome.verdict.passed, report)
-    return heading + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+    return kalibr_text(chain, heading)
 
 
 def report_values(outcome: CameraCalibration) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from share.lab.calibrate.imu import ImuCharacteristics, SensorNoise
 from share.lab.calibrate.imu_noise import FLICKER_FACTOR, NoiseEstimate
 from share.lab.calibrate.report import AXIS_COLOURS
 from share.lab.evaluate.charts import agg_pyplot, save_png
-from share.recordings.calibration import SERIAL
+from share.recordings.calibration import DEFAULT_TOPICS, SERIAL
 from share.sensors.profile_types import InertialFacts, Profile
 
 GYRO, ACCEL = "gyroscope", "accelerometer"
@@ -73,6 +73,8 @@ def imu_chain_yaml(
     """Return kalibr_imu_chain.yaml, as `share.recordings.calibration` and Kalibr read it. inflate: factor
     on the estimates. serial: of the device."""
     lines = [
+        "%YAML 1.0",  # for OpenCV's FileStorage
+        "---",
         f"# share calibrate imu: {name}, {characteristics.rest_s:.0f} s at rest",
         "# " + ("as measured" if inflate == 1 else f"{inflate:g} times what was measured (--inflate)"),
         "imu0:",
@@ -84,7 +86,8 @@ def imu_chain_yaml(
             lines.append(f"  {sensor}_{key}: {value:.4e}  # {unit}, {_uncertainty_text(estimate)}")
     # quoted, or YAML reads it as a number
     serial_lines = [f"  {SERIAL}: {json.dumps(serial)}"] if serial else []
-    return "\n".join([*lines, f"  update_rate: {characteristics.rate_hz:.3f}", *serial_lines, ""])
+    lines += [f"  update_rate: {characteristics.rate_hz:.3f}", f"  rostopic: {DEFAULT_TOPICS['imu0']}"]
+    return "\n".join([*lines, *serial_lines, ""])
 
 
 def _uncertainty_text(figure: NoiseEstimate) -> str:

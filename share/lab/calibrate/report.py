@@ -45,8 +45,8 @@ def failure_message(chain: Path, reasons: Iterable[str]) -> str:
 
 
 def chain_heading(command: str, source: str, passed: bool, report: str) -> str:
-    """Return the first line of a camchain. report: name of the file with the reasons of a failure."""
-    return f"# share calibrate {command} {source}: {'passed' if passed else f'FAILED, see {report}'}\n"
+    """Return the first remark of a camchain. report: name of the file with the reasons of a failure."""
+    return f"share calibrate {command} {source}: {'passed' if passed else f'FAILED, see {report}'}"
 
 
 def cells_with_sigmas(values: F64, sigmas: F64, digits: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""Read MCAP recordings with ROS 2 messages, ours and others', as a Source; and all samples of the IMU alone.
+"""Read recordings of ROS messages (MCAP, ROS bags), ours and others', as a Source; all samples of the IMU.
 
 The calibration's `rostopic` assigns topics to streams, else the topics' names do. The rig comes from --calib,
 else from our own record in the file, else from CameraInfo and /tf_static.
@@ -18,11 +18,11 @@ import numpy as np
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Rig
+from share.recordings.bags.message_file import MessageFile, open_messages
 from share.recordings.calibration import Calibration
 from share.recordings.calibration_match import device_mismatch, fit_to_recording, unused_streams
 from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.file import McapFile
 from share.recordings.mcap.rig import own_rig, own_serial
 from share.recordings.recording import UNBOUNDED_NS, Recording, select_span
 from share.recordings.trajectory import Trajectory, read_tum
@@ -42,21 +42,21 @@ _MAX_SKEW_NS = 2 * 10**9  # between log times and header stamps, when only a par
 
 def open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> McapSource:
     """Open the recording in `path`. Raises UsageError, DataError, ConfigError."""
-    file = McapFile(path)
+    file = open_messages(path)
     topics = find_topics(file, calibration.topics if calibration else {})
     own = own_rig(file, topics, calibration is None)
     return McapSource(file, topics, calibration, own, frames)
 
 
 class McapSource(Recording):
-    """An MCAP recording with those streams of `topics` (stream -> topic) that the rig has.
+    """A recording of messages with those streams of `topics` (stream -> topic) that the rig has.
 
     Its stamps are log times, which equal the stamps in our recordings and are close to them in others'.
     """
 
     def __init__(
         self,
-        file: McapFile,
+        file: MessageFile,
         topics: dict[str, str],
         calibration: Calibration | None,
         own: Rig | None,
@@ -138,7 +138,7 @@ class McapSource(Recording):
         return np.sort(ros.header_stamps([data for _, _, data in messages if len(data) >= 12]))
 
 
-def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
+def find_topics(file: MessageFile, named: dict[str, str]) -> dict[str, str]:
     """Return the topic of each stream: as `named` (with or without image_transport's suffix), else by hints.
 
     Raises ConfigError if a named topic is missing, or if there is no cam0.
@@ -148,11 +148,7 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     for stream in STREAMS:
         kinds = (ros.IMU_MSG,) if stream == IMU else _IMAGE_TYPES
         candidates = [name for name, kind in topics.items() if kind in kinds]
-        topic = (
-            _named_topic(named[stream], candidates, file)
-            if stream in named
-            else guess_topic(stream, candidates)
-        )
+        topic = _named_topic(named.get(stream), stream, candidates, file) or guess_topic(stream, candidates)
         if topic:
             by_stream[stream] = topic
     if CAM0 not in by_stream:
@@ -164,10 +160,16 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     return by_stream
 
 
-def _named_topic(name: str, candidates: list[str], file: McapFile) -> str:
+def _named_topic(name: str | None, stream: str, candidates: list[str], file: MessageFile) -> str | None:
+    """Return the candidate of this name; None without a name. Our own recordings' name, which every
+    calibration that SHARE writes has, need not be there."""
+    if name is None:
+        return None
     for topic in (name, *(name + suffix for suffix in ros.SUFFIXES)):
         if topic in candidates:
             return topic
+    if name == ros.TOPICS[stream]:
+        return None
     known = ", ".join(candidates) or "none"
     raise ConfigError(f"{file.path}: has no topic {name}, which the calibration names; topics: {known}")
 
@@ -204,7 +206,7 @@ _BATCH_MESSAGES = 20_000
 _LOSS_KIND = "IMU messages"
 
 
-def read_imu(file: McapFile, progress: Callable[[int, int], None], losses: DataLosses) -> tuple[I64, F64]:
+def read_imu(file: MessageFile, progress: Callable[[int, int], None], losses: DataLosses) -> tuple[I64, F64]:
     """Return stamps (N,) ns, unwrapped, in the order of the log, and values (N, 6), rad/s and m/s^2.
 
     Images are skipped, and messages parsed in batches. progress: called with the samples read and their

@@ -23,17 +23,11 @@ from share.recordings.images import EncodedImage
 from share.recordings.mcap import rig as ros_rig
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.file import BoundedFile, check_magic, chunk_records, damage_errors
+from share.recordings.mcap.message_writer import CHUNK_BYTES, MessageWriter
 from share.sensors.measurement import DEPTH, IMU, Measurement
 from share.vision.image_codec import encode_jpeg
 
-_CHUNK_BYTES = 256 * 1024
 _FLUSH_PERIOD_NS = 10**9  # a crash loses at most this much
-_FOREVER = "{sec: 9223372036, nsec: 854775807}"
-_LATCHED = {  # transient local: a player sends it to late subscribers too
-    "offered_qos_profiles": "- {history: 1, depth: 1, reliability: 1, durability: 1, "
-    f"deadline: {_FOREVER}, lifespan: {_FOREVER}, liveliness: 1, "
-    f"liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}\n"
-}
 
 
 def part_path(path: Path) -> Path:
@@ -66,8 +60,6 @@ class Recorder:
         durable: bool = False,
         serial: str | None = None,
     ) -> None:
-        from mcap.writer import Writer
-
         self.path, self.part = check_replaceable(path), part_path(path)
         self._rig, self._jpeg, self._durable = rig, jpeg, durable
         try:
@@ -76,13 +68,13 @@ class Recorder:
             raise leftover_error(self.part) from None
         except OSError as error:
             raise UsageError(f"{self.part}: cannot be written: {error.strerror}") from None
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
-        self._writer.start(profile="ros2", library="share")
+        self._writer = MessageWriter(self._file)
         metadata = {"rig": ros_rig.rig_to_json(rig), "schema": "1"} | ({"serial": serial} if serial else {})
         self._writer.add_metadata(ros.RIG_RECORD, metadata)
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
-        self._counts: dict[str, int] = {}
+        self._camera_infos = {
+            stream: ros.encode(ros_rig.to_camera_info(camera, ros.make_header(0, stream)))
+            for stream, camera in rig.cameras.items()
+        }
         self._flushed_ns: int | None = None
         self._log_ns = 0
 
@@ -95,7 +87,7 @@ class Recorder:
             raise DataError(f"{self.path}: stamp {stamp} ns does not fit a ROS 2 message")
         with write_errors(self.path):
             if self._flushed_ns is None:
-                self._write_rig(stamp)
+                self._writer.write(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), self._log_ns, latched=True)
             if measurement.stream == IMU:
                 self._write_message(ros.TOPICS[IMU], ros.imu_message(stamp, measurement.payload))
             else:
@@ -133,6 +125,9 @@ class Recorder:
 
     def _write_image(self, stream: str, stamp: int, image: Any) -> None:
         header, is_depth, topic = ros.make_header(stamp, stream), stream == DEPTH, ros.TOPICS[stream]
+        if (info := self._camera_infos.get(stream)) is not None:
+            stamped = ros.with_stamp(info, stamp)
+            self._writer.write_encoded(ros.INFO_TOPICS[stream], ros.CAMERA_INFO, stamped, self._log_ns)
         data = self._encode(image, is_depth)
         if data is None:
             self._write_message(topic, ros.encode_raw(header, image.load()))
@@ -149,25 +144,8 @@ class Recorder:
             return encode_jpeg(image.load(), self._jpeg)
         return image.read() if isinstance(image, EncodedImage) else None
 
-    def _write_rig(self, stamp: int) -> None:
-        for stream, camera in self._rig.cameras.items():
-            info = ros_rig.to_camera_info(camera, ros.make_header(stamp, stream))
-            self._write_message(ros.INFO_TOPICS[stream], info)
-        self._write_message(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), _LATCHED)
-
-    def _write_message(self, topic: str, message: Any, metadata: dict[str, str] | None = None) -> None:
-        if topic not in self._channels:
-            kind = message.__msgtype__
-            if kind not in self._schemas:
-                self._schemas[kind] = self._writer.register_schema(
-                    kind, "ros2msg", ros.message_definition(kind)
-                )
-            self._channels[topic] = self._writer.register_channel(
-                topic, "cdr", self._schemas[kind], metadata or {}
-            )
-        number = self._counts[topic] = self._counts.get(topic, 0) + 1
-        log_ns = self._log_ns
-        self._writer.add_message(self._channels[topic], log_ns, ros.encode(message), log_ns, number)
+    def _write_message(self, topic: str, message: Any) -> None:
+        self._writer.write(topic, message, self._log_ns)
 
     def _flush(self, stamp: int) -> None:
         self._flushed_ns = stamp
@@ -206,7 +184,7 @@ def recover_recording(path: Path, out: Path, progress: Callable[[int], None] = l
 def _copy(file: BinaryIO, target: IO[bytes], progress: Callable[[int], None]) -> Recovered:
     from mcap.writer import Writer
 
-    writer = Writer(target, chunk_size=_CHUNK_BYTES)
+    writer = Writer(target, chunk_size=CHUNK_BYTES)
     writer.start(profile="ros2", library="share")
     copier = _Copier(writer)
     lost_bytes, reason = _copy_records(file, copier, progress)

@@ -18,9 +18,10 @@ from share.files.json_file import parse_json
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.lens import EQUIDISTANT, RADTAN
+from share.recordings.bags.message_file import MessageFile
 from share.recordings.calibration import config_errors
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.file import McapFile, damage_errors
+from share.recordings.mcap.file import damage_errors
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
 from share.types import F64
 
@@ -101,18 +102,21 @@ def from_camera_info(info: Any, where: str) -> Camera:
         raise ConfigError(f"{where}: {error}; give the calibration with --calib") from None
 
 
-def to_tf(rig: Rig, stamp_ns: int) -> Any:
-    """Return the extrinsics of a rig as transforms body -> cam0 -> cam1, depth."""
+def to_tf(rig: Rig, stamp_ns: int, prefix: str = "") -> Any:
+    """Return the extrinsics of a rig as transforms body -> cam0 -> cam1, depth. prefix: of frames' names."""
     edges = {(ros.BODY, CAM0): rig.T_body_cam0}
     if rig.T_cam1_cam0 is not None:
         edges[CAM0, CAM1] = se3.inverse(rig.T_cam1_cam0)
     if rig.T_depth_cam0 is not None:
         edges[CAM0, DEPTH] = se3.inverse(rig.T_depth_cam0)
-    transforms = [_transform(parent, child, T, stamp_ns) for (parent, child), T in edges.items()]
+    transforms = [
+        to_transform(prefix + parent, prefix + child, T, stamp_ns) for (parent, child), T in edges.items()
+    ]
     return ros.make_message(ros.TF, transforms=transforms)
 
 
-def _transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
+def to_transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
+    """Return the pose T_parent_child (4, 4) as a TransformStamped."""
     x, y, z = T[:3, 3].tolist()
     qx, qy, qz, qw = se3.quat_from_matrix(T[:3, :3]).tolist()
     return ros.make_message(
@@ -158,7 +162,7 @@ class FrameTree:
 # ---- The rig of a file
 
 
-def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
+def own_rig(file: MessageFile, topics: dict[str, str], needed: bool) -> Rig | None:
     """Return the rig in our record of the file, else (if `needed`) that of CameraInfo; None if unknown."""
     record = _rig_record(file)
     if "rig" in record:
@@ -166,12 +170,12 @@ def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
     return _rig_from_messages(file, topics) if needed else None
 
 
-def own_serial(file: McapFile) -> str | None:
+def own_serial(file: MessageFile) -> str | None:
     """Return the device's serial number; None if unknown."""
     return _rig_record(file).get("serial")
 
 
-def _rig_record(file: McapFile) -> dict[str, str]:
+def _rig_record(file: MessageFile) -> dict[str, str]:
     """Return our metadata record of the device; empty for other recordings, or if damaged."""
     try:
         return file.metadata(ros.RIG_RECORD)
@@ -179,7 +183,7 @@ def _rig_record(file: McapFile) -> dict[str, str]:
         return {}
 
 
-def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
+def _rig_from_messages(file: MessageFile, topics: dict[str, str]) -> Rig | None:
     """Return the rig of CameraInfo and /tf_static, None without cam0's CameraInfo.
 
     Raises ConfigError for a recording with an IMU, whose noise no message states.
@@ -208,7 +212,7 @@ def _rig_from_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
         return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
 
 
-def _camera_info(file: McapFile, topic: str) -> Any | None:
+def _camera_info(file: MessageFile, topic: str) -> Any | None:
     """Return the first CameraInfo of an image topic; None if there is none."""
     for suffix in ros.SUFFIXES:
         topic = topic.removesuffix(suffix)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -42,7 +43,7 @@ def typestore() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def make_message(name: str, **fields: Any) -> Any:
+def make_message(name: str, /, **fields: Any) -> Any:
     """Return a message of type `name`."""
     return typestore().types[name](**fields)
 
@@ -63,6 +64,12 @@ def header_stamps(messages: list[bytes]) -> I64:
     """Return the header stamps (N,) ns of encoded messages, without decoding them."""
     pairs = np.frombuffer(b"".join(data[4:12] for data in messages), "<u4").reshape(-1, 2).astype(np.int64)
     return np.asarray(pairs[:, 0] * 10**9 + pairs[:, 1])
+
+
+def with_stamp(data: bytes, stamp_ns: int) -> bytes:
+    """Return an encoded message that begins with a header, with another stamp."""
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    return data[:4] + struct.pack("<iI", seconds, nanoseconds) + data[12:]
 
 
 def encode(message: Any) -> bytes:
@@ -202,11 +209,11 @@ _UNKNOWN_COVARIANCE = np.zeros(9)
 _NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # sensor_msgs/Imu: -1 marks a missing orientation
 
 
-def imu_message(stamp: int, sample: ImuSample) -> Any:
+def imu_message(stamp: int, sample: ImuSample, frame: str = BODY) -> Any:
     wx, wy, wz, ax, ay, az = (float(value) for value in sample)
     return make_message(
         IMU_MSG,
-        header=make_header(stamp, BODY),
+        header=make_header(stamp, frame),
         orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=_NO_ORIENTATION,
         angular_velocity=make_message("geometry_msgs/msg/Vector3", x=wx, y=wy, z=wz),

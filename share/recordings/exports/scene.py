@@ -1,0 +1,88 @@
+"""What is exported: agents that move in one frame, and pictures that they took with points in them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from share.geometry import se3
+from share.geometry.camera import Camera, Rig
+from share.recordings.recording import Source
+from share.recordings.trajectory import Trajectory
+from share.types import F32, F64
+
+Progress = Callable[[int], None]
+COLOURS: tuple[tuple[int, int, int], ...] = (  # matplotlib's tab10: one per agent, in order
+    (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189),
+    (140, 86, 75), (227, 119, 194), (127, 127, 127), (188, 189, 34), (23, 190, 207),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SceneAgent:
+    """An agent: its poses T_world_body, and its rig where that is known. source: of all its images and
+    samples; None where there are only the pictures of `SceneView`."""
+
+    trajectory: Trajectory
+    rig: Rig | None = None
+    source: Source | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneView:
+    """A keyframe. points (N, 3): in the camera cam0, m, and all known.
+
+    jpeg: reads its picture, of the camera's size; empty where there is none.
+    """
+
+    agent: str
+    number: int
+    stamp_ns: int
+    T_world_body: F64
+    points: F64
+    jpeg: Callable[[], bytes]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """name: of the map, or the recording. frame: of all poses, such as `map` or `odom`. agents: by name."""
+
+    name: str
+    frame: str
+    agents: Mapping[str, SceneAgent]
+    views: Sequence[SceneView] = field(default_factory=tuple)
+
+    def camera(self, view: SceneView) -> Camera | None:
+        """Return the camera of a view."""
+        rig = self.agents[view.agent].rig
+        return None if rig is None else rig.cam0
+
+    def T_world_cam0(self, view: SceneView) -> F64:
+        rig = self.agents[view.agent].rig
+        return view.T_world_body if rig is None else view.T_world_body @ rig.T_body_cam0
+
+    def world_points(self, view: SceneView) -> F64:
+        """Return the points (N, 3) of a view in the frame of the scene."""
+        return se3.transform(self.T_world_cam0(view), view.points)
+
+
+def known_points(points: F32) -> F64:
+    """Return the rows of (N, 3) without NaN."""
+    return points[~np.isnan(points).any(axis=1)].astype(np.float64)
+
+
+def plain_names(names: Sequence[str]) -> dict[str, str]:
+    """Return a distinct name for each that is allowed in a file name, a ROS topic and a frame: letters,
+    digits and underscores, not beginning with a digit."""
+    out: dict[str, str] = {}
+    for name in names:
+        plain = base = re.sub(r"[^A-Za-z0-9_]", "_", name if not name[:1].isdigit() else f"_{name}") or "_"
+        number = 1
+        while plain in out.values():
+            number += 1
+            plain = f"{base}_{number}"
+        out[name] = plain
+    return out

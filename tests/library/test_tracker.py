@@ -1,0 +1,149 @@
+"""The library's tracker: the same poses as `share track`, and one's own camera sample by sample."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.recordings import make_euroc
+
+from share import Frame, ShareError, Tracker, load_calibration, open_recording
+from share.geometry.se3 import inverse, log
+from share.recordings.trajectory import read_tum
+
+
+@pytest.fixture(scope="module")
+def tracked(plain_session):
+    """A headset's recording and its poses."""
+    recording = open_recording(plain_session / "ar1")
+    tracker = Tracker(recording.rig)
+    return recording, [pose for frame in recording if (pose := tracker.track(frame))]
+
+
+@pytest.mark.long
+def test_poses_are_those_of_share_track(tracked, share, plain_session, tmp_path):
+    _, poses = tracked
+    assert share("track", plain_session / "ar1", "--out", tmp_path / "t.tum").code == 0
+    written = read_tum(tmp_path / "t.tum")
+    assert [pose.stamp_ns for pose in poses] == written.stamps_ns.tolist()
+    assert np.allclose([pose.T_odom_body for pose in poses], written.T, atol=2e-9)
+
+
+@pytest.mark.long
+def test_velocity_is_the_derivative_of_the_pose(tracked):
+    """By central differences over 2 frames: 133 ms of a walk."""
+    _, poses = tracked
+    for before, pose, after in zip(poses[15:], poses[16:], poses[17:], strict=False):
+        dt = (after.stamp_ns - before.stamp_ns) * 1e-9
+        assert np.allclose(pose.velocity, (after.position - before.position) / dt, atol=0.12)
+        turned = log(inverse(before.T_odom_body) @ after.T_odom_body)[:3] / dt
+        assert np.allclose(pose.angular_velocity, turned, atol=0.15)
+    speeds = [np.linalg.norm(pose.velocity) for pose in poses[15:]]
+    assert max(speeds) > 0.3  # or the comparison says little
+
+
+@pytest.mark.long
+def test_covariances_are_positive_definite(tracked):
+    for pose in tracked[1]:
+        assert np.linalg.eigvalsh(pose.cov).min() > 0
+        assert pose.map_cov is None and pose.T_map_body is None and pose.map_id is None
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["ar1", "robot"])
+def test_samples_fed_one_by_one_give_the_same_poses(plain_session, name):
+    """As a program's own camera delivers them: in any order between streams; its buffers are used again."""
+    recording = open_recording(plain_session / name, frames=slice(0, 20))
+    whole = Tracker(recording.rig)
+    expected = [pose for frame in recording if (pose := whole.track(frame))]
+    fed = Tracker(recording.rig)
+    poses = []
+    for frame in recording:
+        for stamp, gyro, accel in zip(frame.imu.stamps_ns, frame.imu.gyro, frame.imu.accel, strict=True):
+            poses += fed.feed_imu(int(stamp), gyro.tolist(), accel.tolist())
+        images = [None if one is None else one.copy() for one in (frame.image0, frame.image1, frame.depth)]
+        poses += fed.feed_images(frame.stamp_ns, *images)
+        for image in images:
+            if image is not None:
+                image[:] = 0
+    poses += fed.finish()
+    assert [pose.stamp_ns for pose in poses] == [pose.stamp_ns for pose in expected]
+    assert len(poses) >= 15
+    for mine, theirs in zip(poses, expected, strict=True):
+        assert np.array_equal(mine.T_odom_body, theirs.T_odom_body)
+
+
+def test_a_recording_can_be_read_again(tmp_path):
+    recording = open_recording(make_euroc(tmp_path), frames=slice(1, 4))
+    first, again = list(recording), list(recording)
+    assert len(first) == len(again) == len(recording) == 3
+    assert recording.rig.kind == "stereo+imu" and recording.rate_hz == 20.0
+    assert all(np.array_equal(a.image0, b.image0) for a, b in zip(first, again, strict=True))
+    assert recording.truth().T.shape == (6, 4, 4)
+
+
+def test_a_calibration_is_a_rig():
+    rig = load_calibration("calib/d435i")
+    assert rig.kind == "stereo+imu" and rig.baseline == pytest.approx(0.05)
+
+
+def rig():
+    return load_calibration("calib/d435i")
+
+
+GRAY = np.zeros((480, 848), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("images", "what"),
+    [
+        ((np.zeros((480, 848, 3), np.uint8), GRAY), r"image0: is 480x848x3 uint8, expected 480x848 uint8"),
+        ((GRAY.astype(np.float32), GRAY), "image0: is 480x848 float32, expected 480x848 uint8"),
+        ((GRAY[:100], GRAY), "image0: is 100x848 uint8"),
+        ((GRAY, None), "image1: is missing; the rig has cam0, cam1"),
+        ((GRAY, GRAY, GRAY.astype(np.float32)), "depth: the rig has no depth"),
+        (([[0]], GRAY), "image0: is a list, expected a numpy array"),
+    ],
+)
+def test_images_that_do_not_fit_the_rig_are_refused(images, what):
+    with pytest.raises(ShareError, match=what):
+        Tracker(rig()).feed_images(1, *images)
+    image0, image1, depth = (*images, None, None)[:3]
+    with pytest.raises(ShareError, match=what):
+        Tracker(rig()).track(Frame(1, 0, image0, image1, depth))
+
+
+def test_samples_that_are_none_are_refused():
+    tracker = Tracker(rig())
+    with pytest.raises(ShareError, match=r"gyro: has shape \(2,\), expected three numbers"):
+        tracker.feed_imu(1, [0, 0], [0, 0, 9.81])
+    with pytest.raises(ShareError, match=r"stamp_ns: 1\.5 is not an integer; give nanoseconds"):
+        tracker.feed_imu(1.5, [0, 0, 0], [0, 0, 9.81])
+    with pytest.raises(ShareError, match="stamp_ns: -1 is out of range"):
+        tracker.feed_images(-1, GRAY, GRAY)
+    with pytest.raises(ShareError, match="the rig has no IMU"):
+        Tracker(rig().without_imu()).feed_imu(1, [0, 0, 0], [0, 0, 9.81])
+
+
+def test_frames_must_come_in_order():
+    tracker = Tracker(rig())
+    tracker.track(Frame(100, 0, GRAY, GRAY))
+    with pytest.raises(ShareError, match="100 is not after the last frame's, 100"):
+        tracker.track(Frame(100, 1, GRAY, GRAY))
+
+
+def test_without_features_there_is_no_pose_but_a_reason():
+    tracker = Tracker(rig().without_imu())
+    assert tracker.track(Frame(0, 0, GRAY, GRAY)) is None
+    assert (tracker.state, tracker.waiting_for) == ("INITIALISING", "view")
+
+
+def test_what_cannot_be_tracked_or_opened_is_a_share_error(tmp_path):
+    alone = replace(rig().without_imu(), cam1=None, T_cam1_cam0=None)
+    with pytest.raises(ShareError, match=r"^rig: "):
+        Tracker(alone)
+    with pytest.raises(ShareError, match="no such file"):
+        open_recording(tmp_path / "missing")
+    with pytest.raises(ShareError, match="no such file"):
+        load_calibration(tmp_path / "missing")

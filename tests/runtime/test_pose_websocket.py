@@ -1,0 +1,152 @@
+"""Poses by WebSocket: everyone gets the newest, nobody holds the agent up."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from share.errors import ShareError
+from share.runtime.pose import Pose
+from share.runtime.pose_feed import open_pose_sinks
+from share.types import TrackState
+
+client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
+exceptions = pytest.importorskip("websockets.exceptions")
+ORIGIN = "https://app.example"
+
+
+@pytest.fixture
+def served() -> Iterator[object]:
+    (sink,) = open_pose_sinks(["ws://127.0.0.1:0"], "ann", [ORIGIN])
+    yield sink
+    sink.close()
+
+
+def pose(stamp_ns: int) -> Pose:
+    return Pose(stamp_ns, TrackState.OK, np.eye(4), age_ms=1.0)
+
+
+def connected(sink, **options):
+    connection = client.connect(f"ws://{sink.host}", proxy=None, **options)
+    end = time.monotonic() + 5
+    while not sink._readers and time.monotonic() < end:  # its thread has begun
+        time.sleep(0.005)
+    return connection
+
+
+def test_each_reader_gets_each_pose(served):
+    with connected(served) as one, connected(served) as two:
+        end = time.monotonic() + 5
+        while len(served._readers) < 2 and time.monotonic() < end:
+            time.sleep(0.005)
+        for stamp_ns in (100, 200):
+            served.publish(pose(stamp_ns))
+            got = [json.loads(reader.recv(timeout=5)) for reader in (one, two)]
+            assert [message["stamp_ns"] for message in got] == [stamp_ns] * 2
+            assert got[0]["schema"] == 3 and got[0]["odom"]["position"] == [0.0, 0.0, 0.0]
+        served.publish_state(300, TrackState.LOST)
+        assert json.loads(one.recv(timeout=5))["state"] == "LOST"
+
+
+def test_a_reader_that_does_not_read_costs_nothing(served):
+    """Its socket is full after some thousands of messages; publishing goes on, and the newest comes last."""
+    with connected(served, max_queue=1):
+        longest_s = 0.0
+        for stamp_ns in range(20_000):
+            start_s = time.perf_counter()
+            served.publish(pose(stamp_ns))
+            longest_s = max(longest_s, time.perf_counter() - start_s)
+        assert longest_s < 0.5
+        with connected(served) as other:
+            served.publish(pose(10**6))
+            assert json.loads(other.recv(timeout=5))["stamp_ns"] == 10**6
+        start_s = time.perf_counter()
+        served.close()
+        assert time.perf_counter() - start_s < 3.0
+    assert [one.name for one in threading.enumerate() if one.name == "poses"] == []
+
+
+@pytest.mark.parametrize("origin", [None, ORIGIN, "http://localhost:8080", "http://127.0.0.1"])
+def test_pages_that_may_read(served, origin):
+    with connected(served, origin=origin) as reader:
+        served.publish(pose(7))
+        assert json.loads(reader.recv(timeout=5))["stamp_ns"] == 7
+
+
+@pytest.mark.parametrize("origin", ["https://evil.example", "http://localhost.evil.example", "null"])
+def test_other_pages_are_refused(served, origin, capfd):
+    with pytest.raises(exceptions.InvalidStatus, match="403"):
+        client.connect(f"ws://{served.host}", proxy=None, origin=origin)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_no_websocket_is_no_trouble(served, capfd):
+    with socket.create_connection((served.host.name, served.host.port)) as raw:
+        raw.sendall(b"\x00" * 100_000)
+        with contextlib.suppress(ConnectionError):
+            raw.recv(10)
+    with connected(served) as reader:
+        served.publish(pose(7))
+        assert json.loads(reader.recv(timeout=5))["stamp_ns"] == 7
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.long
+def test_an_agent_serves_the_poses_that_it_sends(share, plain_session, tmp_path):
+    """By WebSocket and by UDP at once, the same."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"ws://127.0.0.1:{free.getsockname()[1]}"
+    got: list[dict[str, object]] = []
+
+    def read() -> None:
+        end = time.monotonic() + 30
+        while not got and time.monotonic() < end:
+            with contextlib.suppress(OSError, exceptions.WebSocketException):
+                for text in client.connect(address, proxy=None):
+                    got.append(json.loads(text))
+            time.sleep(0.05)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    config = tmp_path / "config.yaml"
+    config.write_text("agent: {finish_s: 0.1}\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as app:
+        app.bind(("127.0.0.1", 0))
+        udp = f"udp://127.0.0.1:{app.getsockname()[1]}"
+        options = (
+            "--kind",
+            "ar",
+            "--edge",
+            "127.0.0.1:1",
+            "--config",
+            config,
+            "--poses",
+            address,
+            "--poses",
+            udp,
+        )
+        share("agent", plain_session / "ar1", "--name", "ann", *options)
+        reader.join(timeout=30)
+        app.setblocking(False)
+        sent = {}
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                message = json.loads(app.recv(2048))
+                sent[message["sequence"]] = message
+    assert len(sent) == 45 and len(got) >= 10
+    assert all(message == sent[message["sequence"]] for message in got)
+
+
+def test_a_port_in_use_and_a_wrong_origin_are_refused(served):
+    with pytest.raises(ShareError, match="the port is in use; stop the other server"):
+        open_pose_sinks([f"ws://{served.host}"], "bob")
+    with pytest.raises(ShareError, match=r"--poses-origin app\.example: expected a page's origin"):
+        open_pose_sinks(["ws://127.0.0.1:0"], "bob", ["app.example"])

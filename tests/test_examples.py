@@ -1,0 +1,130 @@
+"""The examples run, and the constant matrices of the receivers are what they say."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.geometry.se3 import from_rt, inverse, quat_from_matrix, so3_exp
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+CONVENTIONS = json.loads((EXAMPLES / "conventions.json").read_text())
+FRAMES = ("rep103", "unity", "webxr")
+
+
+def started(name: str, *arguments: object) -> subprocess.Popen[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    return subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def lines_of(name: str, *arguments: object) -> list[str]:
+    out, err = started(name, *arguments).communicate(timeout=60)
+    assert err == ""
+    return out.splitlines()
+
+
+@pytest.mark.long
+def test_track_recording(plain_session):
+    lines = lines_of("track_recording.py", plain_session / "ar1")
+    assert len(lines) == 45
+    assert re.fullmatch(r"\d+ +(-?\d+\.\d{3} +){3}m  \d\.\d\d m/s", lines[-1])
+
+
+@pytest.mark.long
+def test_own_camera(plain_session):
+    lines = lines_of("own_camera.py", plain_session / "ar1")
+    assert len(lines) >= 40 and all(re.match(r"\d+  \[.+\] m  ", line) for line in lines)
+    done = started("own_camera.py", plain_session / "nobody")
+    assert re.fullmatch(r"own_camera: .*nobody.*\n", done.communicate(timeout=30)[1])
+
+
+@pytest.mark.long
+def test_run_edge(plain_session):
+    *agents, maps = lines_of("run_edge.py", plain_session / "ar1", plain_session / "ar2")
+    assert len(agents) == 2 and all("m in odom, map ar" in line for line in agents)
+    assert maps.startswith("keyframes in maps: {'ar")
+
+
+@pytest.mark.long
+def test_read_poses(share, plain_session, tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    reader = started("read_poses.py", port)
+    config = tmp_path / "config.yaml"
+    config.write_text("agent: {finish_s: 0.1}\n")
+    options = ("--kind", "ar", "--edge", "tcp://127.0.0.1:1", "--config", config)
+    share("agent", plain_session / "ar1", "--name", "ann", *options, "--poses", f"udp://127.0.0.1:{port}")
+    out, err = reader.communicate(timeout=30)
+    assert err == ""
+    posed = [line for line in out.splitlines() if line.startswith("ann OK odom")]
+    assert len(posed) >= 30 and posed[-1].endswith("m/s")
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_axes_go_where_the_convention_says(frame):
+    """Ahead, left and up of SHARE's world (x, y, z) and of its body (z, -x, -y)."""
+    ahead, left, up = {
+        "rep103": ([1, 0, 0], [0, 1, 0], [0, 0, 1]),
+        "unity": ([0, 0, 1], [-1, 0, 0], [0, 1, 0]),
+        "webxr": ([0, 0, -1], [-1, 0, 0], [0, 1, 0]),
+    }[frame]
+    world, body = (np.array(CONVENTIONS[frame][name]) for name in ("world", "body"))
+    assert np.array_equal(world @ np.eye(3), np.column_stack([ahead, left, up]))
+    assert np.array_equal(body @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]], np.column_stack([ahead, left, up]))
+    handedness = -1 if frame == "unity" else 1
+    assert np.linalg.det(world) == pytest.approx(handedness) == np.linalg.det(body)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_converted_pose_takes_points_where_the_pose_did(frame, rng):
+    world, body = (np.array(CONVENTIONS[frame][name], float) for name in ("world", "body"))
+    T = from_rt(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    converted = from_rt(world @ T[:3, :3] @ body.T, world @ T[:3, 3])
+    assert np.linalg.det(converted[:3, :3]) == pytest.approx(1)
+    point = rng.normal(size=3)  # in the body
+    expected = world @ (T[:3, :3] @ point + T[:3, 3])
+    assert np.allclose(converted[:3, :3] @ (body @ point) + converted[:3, 3], expected)
+
+
+@pytest.mark.parametrize(
+    ("file", "frame"), [("unity/SharePoses.cs", "unity"), ("webxr/share-poses.js", "webxr")]
+)
+def test_receivers_have_the_matrices(file, frame):
+    text = (EXAMPLES / file).read_text()
+    for name in ("world", "body"):
+        (rows,) = re.findall(rf"(?i)\b{name} = ([\[{{].+[\]}}]);", text)
+        assert json.loads(rows.replace("{", "[").replace("}", "]")) == CONVENTIONS[frame][name]
+        assert np.array_equal(np.linalg.inv(CONVENTIONS[frame]["body"]), CONVENTIONS[frame]["body"])
+    assert re.search(r"schema (!=|===) 3\b", text)
+
+
+def test_the_web_receiver_computes_the_matrix(tmp_path, rng):
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed: the JavaScript is not run")
+    T = from_rt(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    position, quaternion = T[:3, 3].tolist(), quat_from_matrix(T[:3, :3]).tolist()
+    module = tmp_path / "poses.mjs"
+    module.write_text((EXAMPLES / "webxr/share-poses.js").read_text())
+    program = tmp_path / "run.mjs"
+    program.write_text(
+        'import { toMatrix } from "./poses.mjs";\n'
+        f"console.log(JSON.stringify(toMatrix({position}, {quaternion})));\n"
+    )
+    done = subprocess.run([node, program], capture_output=True, text=True, timeout=30, check=True)
+    world, body = (np.eye(4), np.eye(4))
+    world[:3, :3], body[:3, :3] = CONVENTIONS["webxr"]["world"], CONVENTIONS["webxr"]["body"]
+    expected = world @ T @ inverse(body)
+    assert np.allclose(np.reshape(json.loads(done.stdout), (4, 4), order="F"), expected, atol=1e-12)
