@@ -13,10 +13,11 @@ from share.geometry import se3
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredMap, map_poses
+from share.protocol.agent_health import PoseAges
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import TrackState
-from share.wire.messages import Hello, Status, peer_id
+from share.wire.messages import Hello, PoseUpdate, Status, peer_id
 
 SILENT_S = 0.7  # agents report twice a second; after this the last report is no longer shown as the state
 SILENT = "SILENT"
@@ -31,18 +32,25 @@ class PeerStatus:
         self._age_ms: float | None = None  # of the newest pose at `_age_at_ns`
         self._age_at_ns = 0
         self._has_left = False
+        self._pose_ages = PoseAges()
+        self._unacknowledged_ms = 0.0
+        self._clock_error_ms: float | None = None
 
     def update(self, status: Status, now_ns: int) -> None:
         self.state, self._reason, self._has_left = status.state, status.reason, False
         self._age_ms, self._age_at_ns = status.pose_age_ms, now_ns
+        self._unacknowledged_ms, self._clock_error_ms = status.unacknowledged_ms, status.clock_error_ms
 
-    def add_pose(self, state: TrackState, now_ns: int) -> None:
-        """Record a pose message. Its pose is about as old as the newest was at the last status."""
+    def add_pose(self, state: TrackState, now_ns: int, age_ms: float | None = None) -> None:
+        """Record a pose message. age_ms: of its pose; None: about that of the newest at the last status."""
         if state is not self.state:
             self._reason = ""
         self.state, self._has_left = state, False
         if state.has_pose:
             self._age_at_ns = now_ns
+            if age_ms is not None:
+                self._age_ms = age_ms
+                self._pose_ages.add(age_ms, now_ns)
 
     def leave(self) -> None:
         """Record a bye: silence is expected from now on."""
@@ -53,7 +61,8 @@ class PeerStatus:
         reported. last_received_ns: time of the last message; None: none in this session."""
         if last_received_ns is None:
             reason = "no message since the map was restored"
-            return {"state": SILENT, "reason": reason, "pose_age_ms": None, "last_received_s": None}
+            unknown = {"state": SILENT, "reason": reason, "pose_age_ms": None, "last_received_s": None}
+            return unknown | self._link_report(now_ns)
         silent_ns = max(0, now_ns - last_received_ns)
         since_ms = max(0, now_ns - self._age_at_ns) / 1e6
         silent = silent_ns > seconds_to_ns(SILENT_S) and not self._has_left
@@ -63,6 +72,14 @@ class PeerStatus:
             "reason": reason if silent else self._reason,
             "pose_age_ms": None if self._age_ms is None else round(self._age_ms + since_ms, 1),
             "last_received_s": round(silent_ns / SECOND_NS, 3),
+            **self._link_report(now_ns),
+        }
+
+    def _link_report(self, now_ns: int) -> dict[str, Any]:
+        return {
+            **self._pose_ages.report(now_ns),
+            "unacknowledged_ms": round(self._unacknowledged_ms, 1),
+            "clock_error_ms": None if self._clock_error_ms is None else round(self._clock_error_ms, 3),
         }
 
 
@@ -126,6 +143,8 @@ class Peer(Sender):
     last_finding: MapEvent | None = None  # newest correction, repeated with a welcome
     is_welcomed: bool = True  # in this session of the edge
     has_sent: bool = True  # a message in this session
+    joined_ns: int | None = None  # first message in this session
+    latest_pose: PoseUpdate | None = None
     pending_saves: int = 0
     credential: str | None = ""
 

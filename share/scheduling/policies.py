@@ -89,6 +89,7 @@ class BaseDelay:
         return BaseDelay(minima)
 
 
+LOW_QOE = 0.5  # share of its target below which a QoE is low
 _FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 
 
@@ -241,11 +242,13 @@ class RateScheduler:
         self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
         self._history: dict[str, RingBuffer] = {}  # of all runs of a name
         self._latest: dict[str, RatedEvaluation] = {}  # of the present run
+        self._low_since_s: dict[str, float] = {}  # of the present run, while its QoE is low
 
     def begin_run(self, agent: str) -> None:
         """Start a new run of an agent, without a limit until its first evaluation."""
         self._policy.forget(agent)
         self._latest.pop(agent, None)
+        self._low_since_s.pop(agent, None)
 
     def forget(self, agent: str) -> None:
         """Drop all state and history of a name."""
@@ -258,7 +261,12 @@ class RateScheduler:
         """Return the rate to send to the agent, Hz; None: no limit. t_s: time for the report."""
         rate_hz = self._policy.rate(agent, kind, evaluation.delay_ms, evaluation.error_cm, now_ns)
         delay_ms, error_cm = evaluation.delay_ms, evaluation.error_cm
-        value = qoe(delay_ms, error_cm, QoeParameters.from_config(self._config, kind, agent))
+        parameters = QoeParameters.from_config(self._config, kind, agent)
+        value = qoe(delay_ms, error_cm, parameters)
+        if value < LOW_QOE * parameters.target:
+            self._low_since_s.setdefault(agent, t_s)
+        else:
+            self._low_since_s.pop(agent, None)
         rated = RatedEvaluation(
             *(None if x is None else round(x, 4) for x in (t_s, delay_ms, error_cm, value, rate_hz))
         )
@@ -266,10 +274,18 @@ class RateScheduler:
         self._latest[agent] = rated
         return rate_hz
 
-    def report(self, agent: str | None) -> dict[str, float | None]:
-        """Return `rate_hz` and `qoe` for edge.json, the newest of the present run; None: no run."""
+    def report(self, agent: str | None, kind: AgentKind) -> dict[str, float | None]:
+        """Return what edge.json has of an agent's present run; None: no run. qoe_low_s: how long its QoE has
+        been below half of its target."""
         rated = None if agent is None else self._latest.get(agent)
-        return {name: None if rated is None else getattr(rated, name) for name in ("rate_hz", "qoe")}
+        low_since_s = None if agent is None else self._low_since_s.get(agent)
+        low_s = 0.0 if rated is None or rated.t_s is None or low_since_s is None else rated.t_s - low_since_s
+        newest = {
+            name: None if rated is None else getattr(rated, name)
+            for name in ("rate_hz", "qoe", "delay_ms", "error_cm")
+        }
+        target = QoeParameters.from_config(self._config, kind, agent or "").target
+        return {**newest, "qoe_target": target, "qoe_low_s": round(low_s, 3)}
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""
