@@ -84,7 +84,9 @@ def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) 
             late = f"{ms / 1e3:.1f} s" if ms >= 1000 else f"{ms:.0f} ms"
             out.append(f"{what} {late}, limit {limit_ms:.0f} ms")
     if report["qoe_low_s"] >= _LOW_QOE_S:
-        out.append(f"QoE {report['qoe']:.2f} for {report['qoe_low_s']:.0f} s, target {report['qoe_target']:.2f}")
+        out.append(
+            f"QoE {report['qoe']:.2f} for {report['qoe_low_s']:.0f} s, target {report['qoe_target']:.2f}"
+        )
     clock_error_ms = report["clock_error_ms"]
     if joined_s > _CLOCK_GRACE_S and (clock_error_ms is None or clock_error_ms > _CLOCK_ERROR_MS):
         known = "unknown" if clock_error_ms is None else f"known to {clock_error_ms:.0f} ms"

@@ -26,7 +26,7 @@ class StatusServer:
 
     report: returns the edge's report as in edge.json, with current problems as `trouble`, `last_solve_s` and
     `uptime_s` where known. Called from the server's thread; if it fails, the response says so, and `notify`
-    is called once. Raises UsageError or TransportError like `WebServer`.
+    is called once. token: as in `WebServer`. Raises UsageError or TransportError like it.
     """
 
     def __init__(
@@ -34,12 +34,13 @@ class StatusServer:
         address: str,
         report: Callable[[], dict[str, Any]],
         notify: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+        token: str | None = None,
     ) -> None:
         self._get_report, self._notify = report, notify
         self._start_s = time.monotonic()
         self._cache: dict[str, tuple[float, Response]] = {}
         self._failed = False
-        self._server = WebServer(address, self._respond)
+        self._server = WebServer(address, self._respond, token)
 
     @property
     def endpoint(self) -> str:
