@@ -16,7 +16,10 @@ from share.view.room import LastCorrection, Room
 _AGES_SHOWN = 150  # poses in a sparkline: ten seconds at 15 Hz
 _WIDTH, _HEIGHT = 240.0, 34.0  # px, of a sparkline
 _DECISIONS = ("maps merged", "merge undone", "merge skipped", "loop refused", "loop not accepted")
-_BAD, _DIM = "#e5484d", "opacity:.65"
+_BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
+_NAME = f"{_DIM};padding-right:8px;vertical-align:top"
+_BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
+_SPARKLINE = "width:100%;max-width:320px;display:block"
 _LINES_SHOWN = 4  # newest merges
 
 
@@ -69,7 +72,7 @@ class Panel:
             lines = "".join(f"<div>{escape(line)}</div>" for line in reversed(self._merges))
             parts.append(f'<div style="margin-top:8px"><b>merges</b>{lines}</div>')
         body = "".join(parts) or "no agent yet"
-        return f'<div style="font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere">{body}</div>'
+        return f'<div style="{_BODY}">{body}</div>'
 
     def _of(self, name: str) -> _AgentHistory:
         return self._history.setdefault(name, _AgentHistory())
@@ -92,15 +95,13 @@ class Panel:
         if agent["map_id"] is not None:
             rows.append(("map", str(agent["map_id"])))
         cells = "".join(
-            f'<tr><td style="{_DIM};padding-right:8px;vertical-align:top">{name}</td><td>{escape(value)}</td></tr>'
-            for name, value in rows
+            f'<tr><td style="{_NAME}">{name}</td><td>{escape(value)}</td></tr>' for name, value in rows
         )
         swatch = "rgb({}, {}, {})".format(*colour)
         is_bad = state in ("LOST", "SILENT") or bool(agent["trouble"])
-        head = (
-            f'<div><span style="color:{swatch}">&#9632;</span> <b>{escape(label)}</b> {escape(agent["kind"])} '
-            f'<b style="color:{_BAD if is_bad else "#30a46c"}">{escape(state)}</b></div>'
-        )
+        who = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
+        how = f'<b style="color:{_BAD if is_bad else _GOOD}">{escape(state)}</b>'
+        head = f'<div><span style="color:{swatch}">&#9632;</span> {who} {how}</div>'
         faults = "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
         decision = f'<div style="{_DIM}">{escape(history.decision)}</div>' if history.decision else ""
         fade = "opacity:.5;" if agent["gone"] else ""
@@ -125,7 +126,7 @@ def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:
     limit_y = _HEIGHT * (1 - limit / top)
     line = f'<line x1="0" x2="{_WIDTH:.0f}" y1="{limit_y:.1f}" y2="{limit_y:.1f}"'
     return (
-        f'<svg viewBox="0 0 {_WIDTH + 34:.0f} {_HEIGHT:.0f}" style="width:100%;max-width:320px;display:block">'
+        f'<svg viewBox="0 0 {_WIDTH + 34:.0f} {_HEIGHT:.0f}" style="{_SPARKLINE}">'
         f'{line} stroke="{_BAD}" stroke-dasharray="4 3"/>'
         f'<text x="{_WIDTH + 3:.0f}" y="{limit_y + 3:.1f}" font-size="9" fill="{_BAD}">{limit:.0f} ms</text>'
         f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.3"/></svg>'

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -58,7 +59,7 @@ class Room:
         self._loops = LoopLines()
         self._slots: dict[str, int] = {}  # place of each map, beside each other
         # how to draw what has changed, by name
-        self._dirty: dict[str, Callable[[], list[dr.Drawing]]] = {name: _nothing for name in self._drawn}
+        self._dirty: dict[str, Callable[[], list[dr.Drawing]]] = dict.fromkeys(self._drawn, _nothing)
         self._temporary: dict[str, float] = {}  # until when things are shown, by name
         self._moved_runs: set[str] = set()
         self._pictures: dict[str, bytes] = {}
@@ -322,7 +323,7 @@ class Room:
         if len(placed) < 2:
             return []
         points = np.array([position + self._offset(map_id) for map_id, position in placed])
-        same_map = np.array([a[0] == b[0] for a, b in zip(placed, placed[1:], strict=False)])
+        same_map = np.array([a[0] == b[0] for a, b in pairwise(placed)])
         segments = np.stack([points[:-1], points[1:]], axis=1)[same_map]
         return [_named(_lines(segments, self.colour(run), 3.0), name)] if len(segments) else []
 

@@ -40,7 +40,8 @@ class LiveRoom:
 
     address: HOST:PORT, or a PORT of this machine. token: as in `http_guard`; None: none is needed. notify: is
     called with a line if the process ends by itself.
-    Raises UsageError where viser is missing or the address is malformed, TransportError if it cannot be bound.
+    Raises UsageError where viser is missing or the address is malformed, TransportError if it cannot be
+    bound.
     """
 
     def __init__(

@@ -79,7 +79,7 @@ def test_a_keyframe_is_drawn_once_its_place_is_known() -> None:
     drawings = told(room, corrected("ann", "A", at(10.0)))
     (points,) = of(drawings, "/points/0/0")
     assert isinstance(points, dr.Points)
-    np.testing.assert_allclose(points.points + points.origin, POINTS + [11.0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(points.points + points.origin, POINTS + np.array([11.0, 0, 0]), atol=1e-5)
     assert len(of(drawings, "/keyframes/0/0")) == 1 and any(isinstance(one, dr.Floor) for one in drawings)
 
 
