@@ -29,9 +29,10 @@ from share.protocol.streaming import StreamingAgent
 from share.recordings.losses import DataLosses
 from share.runtime import edge, mapper_process
 from share.runtime.edge import EdgeRun
+from share.runtime.edge_metrics import METRICS, render_metrics
 from share.runtime.frame_consumers import RemoteTracking
 from share.runtime.offline_tracking import track
-from share.runtime.status_server import METRICS, StatusServer, render_metrics
+from share.runtime.status_server import StatusServer
 from share.runtime.worker_process import END, Inbox
 from share.types import TrackState
 from share.wire.codec import encode

@@ -78,6 +78,7 @@ def edge(
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
+    from share.runtime.plan import Plan
     from share.runtime.signals import stop_on_signal
     from share.runtime.status_server import StatusServer
     from share.view.viewer import LiveRoom
@@ -96,10 +97,12 @@ def edge(
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
-        status, rooms = None, list[LiveRoom]()
+        status, rooms, plans = None, list[LiveRoom](), list[Plan]()
         if http is not None:  # before any process starts: the port may be in use
+            plans.append(Plan())
             shown = partial(_shown_report, runs, rooms)
-            status = stack.enter_context(closing(StatusServer(http, shown, stderr.print_line, token)))
+            server = StatusServer(http, shown, stderr.print_line, token, plans[0].report)
+            status = stack.enter_context(closing(server))
         if view is not None:
             rooms.append(stack.enter_context(closing(_open_room(view, token, stderr))))
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
@@ -111,7 +114,7 @@ def edge(
                     out,
                     lambda e: _print_event(stderr, e, verbose),
                     store,
-                    rooms[0].feed if rooms else None,
+                    [*plans, *(room.feed for room in rooms)],
                 )
             )
         )

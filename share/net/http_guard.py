@@ -22,9 +22,10 @@ from pathlib import Path
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from share.errors import UsageError
+from share.files.reading import open_regular
 from share.net.transport import Address, bind_error, parse_address
 
-_LEAST_TOKEN, _MOST_TOKEN = 16, 256  # characters
+_LEAST_TOKEN, _MOST_TOKEN, _MAX_FILE_BYTES = 16, 256, 4096
 _BACKLOG = 16
 
 
@@ -152,21 +153,18 @@ def read_token(path: Path) -> str:
     Raises UsageError.
     """
     try:
-        with open(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
+        if not os.path.lexists(path):
             token = secrets.token_urlsafe(24)
-            file.write(f"{token}\n")
+            with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
+                file.write(f"{token}\n")
             return token
-    except FileExistsError:
-        pass
+        with open_regular(path, _MAX_FILE_BYTES) as stored:
+            is_secret = not os.fstat(stored.fileno()).st_mode & 0o077
+            token = stored.read().decode("ascii", "replace").strip()
     except OSError as error:
-        raise UsageError(f"--http-token {path}: cannot be made: {error.strerror}") from None
-    try:
-        if path.stat().st_mode & 0o077:
-            raise UsageError(f"--http-token {path}: others can read it; `chmod 600 {path}`")
-        with path.open("rb") as file:
-            token = file.read(_MOST_TOKEN + 2).decode("ascii").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"--http-token {path}: cannot be read: {error}") from None
+        raise UsageError(f"--http-token {path}: {error.strerror or error}") from None
+    if not is_secret:
+        raise UsageError(f"--http-token {path}: others can read it; `chmod 600 {path}`")
     if not (_LEAST_TOKEN <= len(token) <= _MOST_TOKEN and all("!" <= c <= "~" for c in token)):
         raise UsageError(
             f"--http-token {path}: expected one word of {_LEAST_TOKEN} to {_MOST_TOKEN} ASCII characters; "

@@ -13,7 +13,7 @@ import queue
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,7 +49,7 @@ from share.protocol.edge_events import (
 from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
-from share.runtime.edge_observer import EdgeObserver, NoObserver
+from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.map_writer import MapWriter
@@ -113,10 +113,10 @@ class EdgeRun:
         out: Path | None,
         on_record: Callable[[dict[str, Any]], None],
         store: MapStore | None = None,
-        observer: EdgeObserver | None = None,
+        observers: Sequence[EdgeObserver] = (),
     ) -> None:
         self._settings, self._link, self._on_record = settings, link, on_record
-        self._observer = NoObserver() if observer is None else observer
+        self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
         has_keys = link.agent_names("") is not None
         notify_map = partial(self._log_event, "map")

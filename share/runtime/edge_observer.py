@@ -28,15 +28,28 @@ class EdgeObserver(Protocol):
         """edge.json as it is now, twice a second."""
 
 
-class NoObserver(EdgeObserver):
-    """Nobody looks on."""
+class EdgeObservers(EdgeObserver):
+    """Shows all of some observers, perhaps none, what happens."""
 
-    def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None: ...
+    def __init__(self, *observers: EdgeObserver) -> None:
+        self._observers = observers
 
-    def add_effect(self, effect: EdgeEffect) -> None: ...
+    def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
+        for one in self._observers:
+            one.begin_session(map_file, known)
 
-    def add_result(self, result: MapperResult) -> None: ...
+    def add_effect(self, effect: EdgeEffect) -> None:
+        for one in self._observers:
+            one.add_effect(effect)
 
-    def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None: ...
+    def add_result(self, result: MapperResult) -> None:
+        for one in self._observers:
+            one.add_result(result)
 
-    def add_report(self, report: Mapping[str, Any]) -> None: ...
+    def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None:
+        for one in self._observers:
+            one.add_poses(poses)
+
+    def add_report(self, report: Mapping[str, Any]) -> None:
+        for one in self._observers:
+            one.add_report(report)

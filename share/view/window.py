@@ -10,10 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from share.errors import DataError
 from share.geometry.se3 import quat_from_matrix
 from share.net.http_guard import HttpGuard
 from share.types import F64, AgentKind
 from share.view import drawing as dr
+from share.vision.image_codec import decode_gray
 
 _MAX_MESSAGE_BYTES = 2**20  # from a browser, which sends its camera and what is chosen
 MAX_BROWSERS = 16
@@ -274,11 +276,13 @@ def _upright(T_room_body: F64, T_body_cam0: F64) -> F64:
 
 def _small_picture(jpeg: bytes) -> Any:
     """Return a JPEG as a small image (h, w, 3) uint8; None if it cannot be decoded."""
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_COLOR_4)
-    if image is None:
+    try:
+        image = decode_gray(jpeg, "image")
+    except DataError:
         return None
     height = max(1, round(image.shape[0] * _PICTURE_PX / image.shape[1]))
-    return cv2.resize(image, (_PICTURE_PX, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, (_PICTURE_PX, height), interpolation=cv2.INTER_AREA)
+    return np.repeat(small[:, :, None], 3, axis=2)
 
 
 @contextmanager

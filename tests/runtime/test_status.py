@@ -25,7 +25,7 @@ from share.mapping.agents.agreement import AgentStanding
 from share.mapping.mapper import Mapper
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddRun, PeerMessageReceived
-from share.runtime import status_server, web
+from share.runtime import edge_metrics, web
 from share.runtime.status_server import CACHE_S, StatusServer
 from share.wire.codec import encode
 from share.wire.messages import peer_id
@@ -178,14 +178,14 @@ def test_metrics_are_read_back():
 def test_metrics_that_the_report_lacks_are_omitted():
     odd = {"agents": {"ann": {"keyframes": "many"}, "bob": None}, "maps": 3, "loops": None, "x_ms": {"n": 0}}
     for report in ({}, odd):
-        body, _ = status_server.render_metrics(report)
+        body, _ = edge_metrics.render_metrics(report)
         assert all(value == value for value in metrics(body).values())
 
 
 def test_every_metric_has_a_value_in_a_real_report():
-    body, _ = status_server.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
+    body, _ = edge_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
     names = {name for name, _ in metrics(body)}
-    absent = {row.name for row in status_server.METRICS} - names
+    absent = {row.name for row in edge_metrics.METRICS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
     not_yet = {
         "share_edge_map_keyframes",
@@ -196,17 +196,17 @@ def test_every_metric_has_a_value_in_a_real_report():
 
 
 def test_names_and_units_are_as_prometheus_wants_them():
-    for row in status_server.METRICS:
+    for row in edge_metrics.METRICS:
         assert re.fullmatch(r"share_edge(_[a-z]+)+", row.name)
-        assert row.help.endswith(".") and len({r.name for r in status_server.METRICS}) == len(
-            status_server.METRICS
+        assert row.help.endswith(".") and len({r.name for r in edge_metrics.METRICS}) == len(
+            edge_metrics.METRICS
         )
 
 
 def test_every_metric_is_in_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "lookup" / "status.md").read_text()
     assert [
-        r.name for r in status_server.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
+        r.name for r in edge_metrics.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
     ] == []
 
 
@@ -402,7 +402,24 @@ def test_a_port_in_use_is_reported():
 
 def test_an_address_of_another_machine_is_reported():
     with pytest.raises(TransportError, match="this machine has no such address"):
-        StatusServer("192.0.2.1:0", lambda: REPORT)
+        StatusServer("192.0.2.1:0", lambda: REPORT, token="x" * 20)
+
+
+def test_other_machines_need_a_token():
+    with pytest.raises(UsageError, match="others could read it; add --http-token FILE"):
+        StatusServer("0.0.0.0:0", lambda: REPORT)
+    server = StatusServer("0.0.0.0:0", lambda: REPORT, token="a-token-of-some-length")
+    try:
+        assert get(server, "/health")[0] == 401
+        assert get(server, "/health", headers={"Authorization": "Bearer a-token-of-some-length"})[0] == 200
+        status, headers, _ = get(server, "/?token=a-token-of-some-length")
+        assert (status, headers["Location"]) == (303, "/")
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert get(server, "/", headers={"Cookie": cookie})[0] == 200
+        foreign = {"Cookie": cookie, "Origin": "http://evil.example"}
+        assert get(server, "/", headers=foreign)[0] == 403
+    finally:
+        server.close()
 
 
 def test_dns_rebinding_is_refused():
