@@ -13,13 +13,14 @@ from share.view import events as ev
 from share.view.drawing import Colour
 from share.view.room import LastCorrection, Room
 
+_MOST_LIMITS = 5.0  # height of a sparkline, in limits; what is later touches its top
 _AGES_SHOWN = 150  # poses in a sparkline: ten seconds at 15 Hz
 _WIDTH, _HEIGHT = 240.0, 34.0  # px, of a sparkline
 _DECISIONS = ("maps merged", "merge undone", "merge skipped", "loop refused", "loop not accepted")
 _BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
 _NAME = f"{_DIM};padding-right:8px;vertical-align:top"
 _BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
-_SPARKLINE = "width:100%;max-width:320px;display:block"
+_SPARKLINE = "width:100%;max-width:320px;display:block;overflow:visible"
 _LINES_SHOWN = 4  # newest merges
 
 
@@ -119,7 +120,7 @@ def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:
     """Return an SVG of values over time, with a dashed line at `limit`; "" without values."""
     if not values:
         return ""
-    top = max(2 * limit, *values)
+    top = limit * min(_MOST_LIMITS, max(2.0, *(value / limit for value in values)))
     step = _WIDTH / (_AGES_SHOWN - 1)
     y = [_HEIGHT * (1 - min(value, top) / top) for value in values]
     points = " ".join(f"{step * k:.1f},{height:.1f}" for k, height in enumerate(y))
