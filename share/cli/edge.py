@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @click.option(
     "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
 )
-@click.option("--view", metavar="[H:]P", help="Show the room live in 3D here (extra share-slam[view]).")
+@click.option("--view", metavar="[H:]P", help="Show the room live in 3D here (needs viser).")
 @click.option(
     "--http-token",
     metavar="FILE",

@@ -84,12 +84,14 @@ class Panel:
         history, limit_ms = self._of(label), LIMITS[AgentKind(agent["kind"])].pose_ms
         state = "gone" if agent["gone"] else agent["state"]
         ages = tuple(history.ages_ms)
-        rows = [
-            ("QoE", f"{_number(agent['qoe'], 2)} (target {_number(agent['qoe_target'], 2)})"),
-            ("keyframes", f"{agent['keyframes']}, at most {_number(agent['rate_hz'], 1)} Hz"),
-            ("delay", f"{_number(agent['delay_ms'], 0)} ms"),
-            ("pose age", f"{_number(agent['pose_ms'], 1)} ms, limit {limit_ms:.0f} ms"),
-        ]
+        rate = "" if agent["rate_hz"] is None else f", at most {agent['rate_hz']:.1f} Hz"
+        rows = [("keyframes", f"{agent['keyframes']}{rate}")]
+        if agent["qoe"] is not None:
+            rows.insert(0, ("QoE", f"{agent['qoe']:.2f} (target {agent['qoe_target']:.2f})"))
+        if agent["delay_ms"] is not None:
+            rows.append(("delay", f"{agent['delay_ms']:.0f} ms"))
+        if agent["pose_ms"] is not None:
+            rows.append(("pose age", f"{agent['pose_ms']:.1f} ms, limit {limit_ms:.0f} ms"))
         if corrected is not None:
             how_far = f"{1e3 * corrected.moved_m:.0f} mm, {max(0.0, now_s - corrected.at_s):.0f} s ago"
             rows.append(("correction", how_far))
@@ -110,10 +112,6 @@ class Panel:
             f'<div style="{fade}margin:0 0 10px">{head}{faults}{sparkline(ages, limit_ms, swatch)}'
             f"<table>{cells}</table>{decision}</div>"
         )
-
-
-def _number(value: Any, digits: int) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:

@@ -19,7 +19,7 @@ from share.mapping.map_changes import (
     StoredMap,
     map_poses,
 )
-from share.types import F32, AgentKind, Keyframe, KeyframeImage
+from share.types import F32, AgentKind, Keyframe, KeyframeImage, View
 from share.view import events as ev
 
 _MAX_DEPTH_M, _MAX_DEPTH_SIGMA_M = 10.0, 0.15  # of points that are shown
@@ -32,16 +32,20 @@ def run_shown(run: str, name: str, kind: AgentKind, rig: Rig) -> ev.RunShown:
 
 
 def keyframe_shown(run: str, keyframe: Keyframe, rig: Rig) -> ev.KeyframeShown:
-    points = np.concatenate([keyframe.view.points, _certain_points(keyframe.image)])
-    points = points[np.isfinite(points).all(axis=1)]
-    T = rig.T_body_cam0
     return ev.KeyframeShown(
         KeyframeKey(run, keyframe.id),
         keyframe.reference < 0,
         keyframe.T_odom_body,
-        np.asarray(points @ T[:3, :3].T + T[:3, 3], np.float32),
+        points_in_body(keyframe.view, keyframe.image, rig),
         keyframe.image.jpeg.tobytes(),
     )
+
+
+def points_in_body(view: View, image: KeyframeImage, rig: Rig) -> F32:
+    """Return the points (n, 3) of a keyframe that are shown, in the body."""
+    points = np.concatenate([view.points, _certain_points(image)])
+    points, T = points[np.isfinite(points).all(axis=1)], rig.T_body_cam0
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3], np.float32)
 
 
 def _certain_points(image: KeyframeImage) -> F32:

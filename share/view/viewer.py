@@ -28,7 +28,7 @@ _PANEL_S = 0.5  # between updates of the panel
 _NICENESS = 15
 _STOP_S = 2.0
 _MAX_EVENTS = 400  # applied before something is drawn
-MISSING = "the live room needs viser: pip install 'share-slam[view]'"
+MISSING = "the live room needs viser: pip install 'viser>=1.1,<2'"
 
 
 def is_installed() -> bool:
