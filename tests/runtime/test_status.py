@@ -108,6 +108,7 @@ def test_health_lists_present_agents():
     expected = {
         "status": "ok",
         "trouble": [],
+        "agent_trouble": [],
         "refused": [],
         "agents": ["ann"],
         "waiting": 3,
@@ -139,6 +140,41 @@ def test_trouble_makes_health_503():
         status, _, body = get(server, "/health")
     assert status == 503
     assert json.loads(body)["status"] == "trouble" and json.loads(body)["trouble"] == trouble
+
+
+def test_an_agents_trouble_is_trouble_but_no_reason_to_restart_the_edge():
+    report = {**REPORT, "agent_trouble": ["agent 'ann': LOST"]}
+    with serving(lambda: report) as server:
+        for path, expected in (("/health", 200), ("/health/agents", 503)):
+            status, _, body = get(server, path)
+            health = json.loads(body)
+            assert (status, health["status"], health["agent_trouble"]) == (
+                expected,
+                "trouble",
+                ["agent 'ann': LOST"],
+            )
+    with serving() as server:
+        assert get(server, "/health/agents")[0] == 200
+
+
+def test_the_quantiles_of_the_pose_delay_are_metrics():
+    report = {"agents": {"ann": {**AGENT, "pose_ages_ms": TIMES, "qoe": 0.9, "delay_ms": 15.0}}}
+    with serving(lambda: report) as server:
+        samples = metrics(get(server, "/metrics")[2])
+    who = {("agent", "ann"), ("kind", "ar")}
+    assert samples["share_edge_pose_delay_seconds", frozenset(who | {("quantile", "0.95")})] == 0.03
+    assert samples["share_edge_pose_delay_seconds_count", frozenset(who)] == 4
+    assert samples["share_edge_qoe", frozenset(who)] == 0.9
+    assert samples["share_edge_delay_seconds", frozenset(who)] == 0.015
+
+
+def test_the_plan_is_served_beside_the_report():
+    server = StatusServer("0", lambda: REPORT, plan=lambda: {"agents": {"ann": {"position": [1.0, 2.0]}}})
+    try:
+        status, _, body = get(server, "/plan.json")
+        assert status == 200 and json.loads(body)["agents"]["ann"]["position"] == [1.0, 2.0]
+    finally:
+        server.close()
 
 
 def test_snapshot_is_the_report_and_its_age():
@@ -189,7 +225,11 @@ def test_every_metric_has_a_value_in_a_real_report():
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
     not_yet = {
         "share_edge_map_keyframes",
+        "share_edge_clock_error_seconds",
+        "share_edge_delay_seconds",
+        "share_edge_keyframe_rate_hertz",
         "share_edge_pose_age_seconds",
+        "share_edge_qoe",
         "share_edge_unidentified_bad_messages_total",
     }
     assert absent <= by_others | not_yet
@@ -222,7 +262,7 @@ def test_the_page_needs_nothing_from_elsewhere():
     with serving() as server:
         status, headers, body = get(server, "/")
     page = body.decode()
-    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 8192
+    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 16384
     assert not re.search(r"https?://|(src|href)=|innerHTML|@import|url\(", page)
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert 'fetch("snapshot.json"' in page
