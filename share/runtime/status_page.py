@@ -64,6 +64,7 @@ tr.gone { color: var(--dim) }
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
 </main>
+<svg id="svg" hidden></svg>
 <script>
 "use strict";
 const at = id => document.getElementById(id);
@@ -105,7 +106,7 @@ const COLOURS = ["#3a97d4", "#e69f00", "#009e73", "#c7b500", "#d55e00", "#cc79a7
 let colours = {};
 const colour = name => colours[name] ??= COLOURS[Object.keys(colours).length % COLOURS.length];
 
-const SVG = "http://www.w3.org/2000/svg";
+const SVG = at("svg").namespaceURI;
 function shape(tag, attributes, content) {
   const element = document.createElementNS(SVG, tag);
   for (const [name, value] of entries(attributes)) element.setAttribute(name, value);
@@ -206,7 +207,8 @@ function show(now) {
   if (typeof now.last_solve_s === "number") about.push(`solved ${duration(now.last_solve_s)} ago`);
   if (now.failed_steps) about.push(`failed steps ${now.failed_steps}`);
   at("room").hidden = !now.live_room;
-  if (now.live_room) at("room").href = `http://${location.hostname}:${now.live_room.split(":").pop()}/`;
+  const port = now.live_room?.split(":").pop();
+  if (port) at("room").href = `${location.protocol}//${location.hostname}:${port}/`;
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
   table("agents",

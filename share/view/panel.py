@@ -105,11 +105,12 @@ class Panel:
         who = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
         how = f'<b style="color:{_BAD if is_bad else _GOOD}">{escape(state)}</b>'
         head = f'<div><span style="color:{swatch}">&#9632;</span> {who} {how}</div>'
+        if agent["gone"]:
+            return f'<div style="opacity:.5;margin:0 0 10px">{head}</div>'
         faults = "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
         decision = f'<div style="{_DIM}">{escape(history.decision)}</div>' if history.decision else ""
-        fade = "opacity:.5;" if agent["gone"] else ""
         return (
-            f'<div style="{fade}margin:0 0 10px">{head}{faults}{sparkline(ages, limit_ms, swatch)}'
+            f'<div style="margin:0 0 10px">{head}{faults}{sparkline(ages, limit_ms, swatch)}'
             f"<table>{cells}</table>{decision}</div>"
         )
 

@@ -25,8 +25,8 @@ COLOURS: tuple[dr.Colour, ...] = (  # of agents, told apart also by those who se
     *((86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66)),
     *((213, 94, 0), (204, 121, 167), (0, 114, 178), (190, 190, 190)),
 )
-_LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (150, 90, 200), (255, 70, 220), (255, 60, 60)
-_MAP_SPACING_M = 12.0  # between maps that are not joined
+_LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
+_MAP_SPACING_M = 10.0  # between maps that are not joined
 _MAX_CHUNKS = 12  # drawn at a time
 _FLASH_S, _TEXT_S = 1.5, 8.0  # how long a loop or correction, and a merge, stand out
 _LEAST_CORRECTION_M = 0.005  # that is marked
@@ -329,7 +329,7 @@ class Room:
 
     def _draw_loops(self, chunk: int, name: str) -> list[dr.Drawing]:
         ends = self._loop_ends(self._loops.chunk(chunk))
-        return [] if ends is None else [_named(_lines(ends, _LOOP_COLOUR, 1.0), name)]
+        return [] if ends is None else [_named(_lines(ends, _LOOP_COLOUR, 2.0), name)]
 
     def _loop_ends(self, loops: Iterable[tuple[KeyframeKey, KeyframeKey]]) -> F64 | None:
         """Return the ends (N, 2, 3) of loops whose keyframes are placed; None without one."""
@@ -360,7 +360,7 @@ class Room:
         covers = old is not None and (low >= old.low).all() and (high <= old.high).all()
         if old is not None and covers and abs(z - old.z) < _FLOOR_STEP_M:
             return None
-        margin = 1.0 if old is None else 3.0  # it grows by steps
+        margin = 0.0 if old is None else 1.5  # it grows by steps
         low, high = np.floor(low - margin), np.ceil(high + margin)
         self._floor = dr.Floor(z, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
         return self._floor

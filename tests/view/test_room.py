@@ -199,7 +199,7 @@ def test_maps_that_are_not_joined_stand_beside_each_other() -> None:
     room = two_maps()
     ann, bob = room.agent_place("ann-1"), room.agent_place("bob-1")
     assert ann is not None and bob is not None
-    assert np.linalg.norm(ann[:3, 3] - bob[:3, 3]) > 10
+    assert np.linalg.norm(ann[:3, 3] - bob[:3, 3]) > 9
 
 
 def test_a_merge_moves_one_map_into_the_other_and_is_announced() -> None:
