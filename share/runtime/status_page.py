@@ -17,6 +17,8 @@ header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem 
 h1 { font-size: 1.25rem; margin: 0 }
 h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
 header span, td.none { color: var(--dim) }
+a { color: inherit }
+td i { display: inline-block; width: .7em; height: .7em; margin-right: .4em; flex: none }
 #mark { font-weight: 600; color: var(--good) }
 .bad, #mark.bad { color: var(--bad) }
 #trouble { margin: .5rem 0 0; padding-left: 1.2rem; color: var(--bad); overflow-wrap: anywhere }
@@ -49,7 +51,9 @@ tr.gone { color: var(--dim) }
     display: flex; justify-content: space-between; gap: .6rem; border: 0; padding: .1rem 0; max-width: none;
     min-width: 0; text-align: right; white-space: normal; overflow-wrap: anywhere }
   td::before { content: attr(data-label); color: var(--dim); flex: none; text-align: left }
-  td:first-child { grid-column: 1 / -1; font-weight: 600 }
+  td:first-child { grid-column: 1 / -1; font-weight: 600; justify-content: flex-start }
+  td:first-child::before { display: none }
+  td[data-label=reason] { grid-column: 1 / -1 }
   td.empty { display: none }
 }
 </style>
@@ -190,6 +194,13 @@ function mark(content, bad) {
   at("mark").className = bad ? "bad" : "";
 }
 
+function named(name) {
+  const cell = node("td", name), swatch = document.createElement("i");
+  swatch.style.background = colour(name);
+  cell.prepend(swatch);
+  return cell;
+}
+
 function show(now) {
   updateRates(now);
   const trouble = [...now.trouble ?? [], ...now.agent_trouble ?? []];
@@ -215,7 +226,7 @@ function show(now) {
     ["name", "state", "pose age", "reason", "kind", "poses come after", "QoE (target)", "delay",
      "keyframes", "rate", "corrections", "map", "kB/s", "loops"],
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      node("td", name), node("td", a.gone ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
+      named(name), node("td", a.gone ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
       node("td", a.gone ? "–" : age(a.pose_age_ms), isStale(a) ? "bad" : ""),
       a.reason, a.kind, a.gone ? "–" : age(a.pose_ms),
       Number.isFinite(a.qoe) ? `${fixed(a.qoe, 2)} (${fixed(a.qoe_target, 2)})` : "–", age(a.delay_ms),
