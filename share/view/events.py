@@ -11,6 +11,9 @@ from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SavePoses
 from share.types import F32, F64, AgentKind, TrackState
 
+MERGES = frozenset(("maps merged", "merge undone"))
+REFUSALS = frozenset(("merge skipped", "loop refused", "loop not accepted"))
+
 
 @dataclass(frozen=True)
 class SessionBegun:

@@ -1,6 +1,7 @@
 """What the edge tells the live room, without ever waiting: a bounded queue that drops its oldest entries.
 
-The edge's loop only appends values that it has anyway. A thread makes events of them and sends them to the
+The edge's loop only appends values that it has anyway; of poses, reports and refusals the newest is kept. A
+thread makes events of them and sends them to the
 viewer's process; if that is slow, this thread waits, and the queue drops.
 """
 
@@ -13,14 +14,15 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from share.geometry.camera import Rig
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, EdgeEffect, MapperResult, WriteEvent
 from share.protocol.peer import RestoredRun
+from share.types import Keyframe
 from share.view import events as ev
 from share.view import sources
-from share.wire.messages import PoseUpdate
+from share.wire.messages import Hello, PoseUpdate
 
 MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB
 _REPORTED = (
@@ -28,6 +30,12 @@ _REPORTED = (
     *("delay_ms", "map_id", "keyframes", "loops"),
 )
 END = b""
+
+
+class _Keyframe(NamedTuple):
+    run: str
+    keyframe: Keyframe
+    rig: Rig
 
 
 class ViewFeed:
@@ -38,9 +46,14 @@ class ViewFeed:
     def __init__(self, connection: Connection, on_end: Callable[[], None] = lambda: None) -> None:
         self._connection, self._on_end = connection, on_end
         self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
-        self._poses: dict[str, PoseUpdate] = {}  # the newest, not queued
+        # the newest of each run or agent, not queued
+        self._poses: dict[str, PoseUpdate] = {}
+        self._refusals: dict[str | None, ev.DecisionMade] = {}
+        self._report: ev.AgentsReported | None = None
         self._sent_stamps: dict[str, int] = {}
         self._rigs: dict[str, Rig] = {}
+        self._runs: dict[str, ev.RunShown] = {}
+        self._left_out_before = 0  # when runs were sent
         self.left_out = 0  # entries that were dropped
         self._wake = threading.Event()
         self._is_closed = False
@@ -52,11 +65,30 @@ class ViewFeed:
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         """Start with what a map file holds. known: its runs, which may come back."""
         self._rigs = {run.key: run.hello.rig for run in known}
+        self._runs = {run.key: _run_shown(run.key, run.hello) for run in known}
         self._add(ev.SessionBegun(map_file))
 
     def add_effect(self, effect: EdgeEffect) -> None:
-        if isinstance(effect, AddRun | AddKeyframe | DropRun | WriteEvent):
-            self._add(effect)
+        match effect:
+            case AddRun():
+                self._rigs[effect.key] = effect.hello.rig
+                self._runs[effect.key] = _run_shown(effect.key, effect.hello)
+                self._add(self._runs[effect.key])
+            case AddKeyframe() if (rig := self._rigs.get(effect.key)) is not None:
+                self._add(_Keyframe(effect.key, effect.keyframe, rig))
+            case DropRun():
+                for known in (self._rigs, self._runs, self._sent_stamps):
+                    known.pop(effect.key, None)
+                self._add(ev.RunRemoved(effect.key))
+            case WriteEvent(fields):
+                self._add_decision(fields)
+
+    def _add_decision(self, fields: Mapping[str, Any]) -> None:
+        """Queue a merge; of refusals, of which there are many, keep the newest of each agent."""
+        if fields["event"] in ev.MERGES:
+            self._add(_decision(fields))
+        elif fields["event"] in ev.REFUSALS:
+            self._refusals[fields["agent"]] = _decision(fields)
 
     def add_result(self, result: MapperResult) -> None:
         self._add(result)
@@ -72,7 +104,8 @@ class ViewFeed:
             label: {name: agent.get(name) for name in _REPORTED}
             for label, agent in report.get("agents", {}).items()
         }
-        self._add(ev.AgentsReported(agents, tuple(report.get("trouble", ())), self.left_out))
+        self._report = ev.AgentsReported(agents, tuple(report.get("trouble", ())), self.left_out)
+        self._wake.set()
 
     def add_event(self, event: ev.RoomEvent) -> None:
         """Add an event as it is."""
@@ -104,10 +137,18 @@ class ViewFeed:
                 self._on_end()
 
     def _take_events(self) -> Iterator[ev.RoomEvent]:
+        if self.left_out != self._left_out_before:  # a run may have been among what was dropped
+            self._left_out_before = self.left_out
+            yield from list(self._runs.values())
         while self._queue:
             with contextlib.suppress(IndexError):  # dropped in between
                 entry = self._queue.popleft()
                 yield from self._events(entry)
+        while self._refusals:
+            yield self._refusals.pop(next(iter(self._refusals)))
+        if (report := self._report) is not None:
+            self._report = None
+            yield report
         for run, pose in self._poses.items():
             if self._sent_stamps.get(run) != pose.stamp_ns:
                 self._sent_stamps[run] = pose.stamp_ns
@@ -115,18 +156,8 @@ class ViewFeed:
 
     def _events(self, entry: object) -> Iterator[ev.RoomEvent]:
         match entry:
-            case AddRun():
-                self._rigs[entry.key] = entry.hello.rig
-                yield sources.run_shown(entry.key, entry.hello.name, entry.hello.kind, entry.hello.rig)
-            case AddKeyframe() if (rig := self._rigs.get(entry.key)) is not None:
-                yield sources.keyframe_shown(entry.key, entry.keyframe, rig)
-            case DropRun():
-                self._rigs.pop(entry.key, None)
-                self._sent_stamps.pop(entry.key, None)
-                yield ev.RunRemoved(entry.key)
-            case WriteEvent(fields):
-                words = fields["agent"], fields["reason"]
-                yield ev.DecisionMade(fields["t_s"], fields["event"], *words)
+            case _Keyframe():
+                yield sources.keyframe_shown(*entry)
             case MapperResult():
                 for change in entry.changes:
                     if (shown := sources.change_shown(change)) is not None:
@@ -136,3 +167,11 @@ class ViewFeed:
                         yield correction
             case _ if isinstance(entry, ev.RoomEvent):
                 yield entry
+
+
+def _run_shown(run: str, hello: Hello) -> ev.RunShown:
+    return sources.run_shown(run, hello.name, hello.kind, hello.rig)
+
+
+def _decision(fields: Mapping[str, Any]) -> ev.DecisionMade:
+    return ev.DecisionMade(fields["t_s"], fields["event"], fields["agent"], fields["reason"])

@@ -16,7 +16,6 @@ from share.view.room import LastCorrection, Room
 _MOST_LIMITS = 5.0  # height of a sparkline, in limits; what is later touches its top
 _AGES_SHOWN = 150  # poses in a sparkline: ten seconds at 15 Hz
 _WIDTH, _HEIGHT = 240.0, 34.0  # px, of a sparkline
-_DECISIONS = ("maps merged", "merge undone", "merge skipped", "loop refused", "loop not accepted")
 _BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
 _NAME = f"{_DIM};padding-right:8px;vertical-align:top"
 _BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
@@ -50,10 +49,10 @@ class Panel:
                 self._names[event.run] = event.name
             case ev.PoseShown() if event.age_ms is not None:
                 self._of(self._names.get(event.run, event.run)).ages_ms.append(event.age_ms)
-            case ev.DecisionMade() if event.event in _DECISIONS:
+            case ev.DecisionMade():
                 if event.agent is not None:
                     self._of(event.agent).decision = f"{event.event}: {event.reason}"
-                if event.event.startswith("maps ") or event.event == "merge undone":
+                if event.event in ev.MERGES:
                     who = "" if event.agent is None else f" {event.agent}:"
                     self._merges.append(f"{event.t_s:.1f} s {event.event}:{who} {event.reason}")
             case ev.AgentsReported():
@@ -103,7 +102,8 @@ class Panel:
         swatch = "rgb({}, {}, {})".format(*colour)
         is_bad = state in ("LOST", "SILENT") or bool(agent["trouble"])
         who = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
-        how = f'<b style="color:{_BAD if is_bad else _GOOD}">{escape(state)}</b>'
+        state_colour = "inherit" if agent["gone"] else _BAD if is_bad else _GOOD
+        how = f'<b style="color:{state_colour}">{escape(state)}</b>'
         head = f'<div><span style="color:{swatch}">&#9632;</span> {who} {how}</div>'
         if agent["gone"]:
             return f'<div style="opacity:.5;margin:0 0 10px">{head}</div>'

@@ -186,7 +186,7 @@ class Room:
                 self._moved_runs.add(entry["run"])
 
     def _announce(self, event: ev.DecisionMade, now_s: float) -> None:
-        if event.event not in ("maps merged", "merge undone"):
+        if event.event not in ev.MERGES:
             return
         title = event.event if event.agent is None else f"{event.event}: {event.agent}"
         self._said.append(dr.Announcement(title, event.reason))
