@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
+from share.cli.live_pages import live_pages
 from share.cli.terminal import Column, LiveLine, Stages, column_table
 from share.config import STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.real_time import Pages
     from share.lab.evaluate.scoring import SessionScore
     from share.metrics.ate import Ate
 
@@ -93,7 +91,7 @@ def demo(
         config=None if config_file is None else str(config_file),
         agents_first=True,
     )
-    pages = _pages(live) if view else None
+    pages = live_pages(live) if view else None
     folders = play_in_real_time(session, seconds, run_terms, out, lambda now: live.write(str(now)), pages)
     live.end()
     result = score_session(session, folders)
@@ -127,37 +125,6 @@ def _renderable_scene(scene: str | None) -> str:
     if missing_renderer is not None:
         click.echo(f"share: using the plain room: {missing_renderer}", err=True)
     return DEFAULT_SCENE if missing_renderer is None else FALLBACK_SCENE
-
-
-def _pages(live: LiveLine) -> Pages:
-    """Return the pages to serve. The first is opened where there is somebody to see it."""
-    from share.lab.evaluate.real_time import Pages
-    from share.view.viewer import MISSING, is_installed
-
-    has_view = is_installed()
-    if not has_view:
-        live.print_line(f"share: {MISSING}; there is a plain page")
-    opened = "live room" if has_view else "status"
-
-    def show(line: str) -> None:
-        live.print_line(line)
-        if live.is_terminal and line.startswith(opened) and _has_screen():
-            _open_browser(line.split()[-1])
-
-    return Pages(has_view, show)
-
-
-def _has_screen() -> bool:
-    """Return whether a browser could open a window here."""
-    return sys.platform == "darwin" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-
-
-def _open_browser(url: str) -> None:
-    """Open a page without waiting; a browser that fails costs the picture only."""
-    import threading
-    import webbrowser
-
-    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
 
 def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool) -> str:

@@ -119,7 +119,7 @@ class AgentRun:
             else LocalTracking(source, settings, self._guard, estimator, self._log, notify)
         )
         self._pose_feed = pose_feed
-        self._late_dropper = LateFrameDropper(late_limit_ms(settings.agent.late_ms, hello.kind, source.rig))
+        self._late_dropper = LateFrameDropper(late_limit_ms(settings.agent.late_ms, hello))
         tolerated_ms = LIMITS[hello.kind].pose_ms
         self._lateness_monitor = LatenessMonitor(notify, self._consumer.bottleneck, tolerated_ms)
         self._counters = SequencerCounters()

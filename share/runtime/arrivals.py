@@ -12,10 +12,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 from share.cameras.feed import CameraFeed
-from share.geometry.camera import Rig
 from share.protocol.agent_events import AgentTick
 from share.protocol.agent_status import LATE_S
 from share.types import AgentKind, Frame, ImuBatch
+from share.wire.messages import Hello
 
 READ_AHEAD = 30  # frames decoded before they are due
 _WAIT_S = 0.1
@@ -173,13 +173,14 @@ class LateFrameDropper:
 _HEADSET_LATE_MS = 100.0  # a headset whose pose is older is better served by a prediction
 
 
-def late_limit_ms(late_ms: float | None, kind: AgentKind, rig: Rig) -> float:
-    """Return the delay from which a frame is not tracked; 0: none is. late_ms: as in the configuration.
+def late_limit_ms(late_ms: float | None, hello: Hello) -> float:
+    """Return the delay from which a frame is not tracked; 0: all are. late_ms: as in the configuration.
 
     By default a headset stays fresh where its IMU can predict its pose; a robot rather waits."""
     if late_ms is not None:
         return late_ms
-    return _HEADSET_LATE_MS if kind is AgentKind.AR and rig.imu is not None else 0.0
+    can_predict = hello.rig.imu is not None and not hello.streams_frames
+    return _HEADSET_LATE_MS if hello.kind is AgentKind.AR and can_predict else 0.0
 
 
 _WINDOW = 100  # frames

@@ -187,6 +187,12 @@ def test_each_agent_can_have_its_own_link(evaluate, plain_session, tmp_path, clo
     assert max(rtt_ms["ar1"], rtt_ms["ar2"]) < 150
 
 
+@pytest.mark.long
+def test_a_run_in_virtual_time_cannot_be_looked_at(evaluate, plain_session, tmp_path):
+    done = evaluate("run", plain_session, "--virtual", "--view", "--out", tmp_path / "out")
+    assert done.code == 2 and "--view shows a run in real time" in done.err
+
+
 @pytest.mark.slow
 def test_same_seed_gives_the_same_virtual_run(evaluate, plain_session, tmp_path):
     """And odometry is that of real time, to the last digit."""

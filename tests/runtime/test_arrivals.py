@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.hellos import rig_of
+from helpers.hellos import hello_of
 
 from share.protocol.agent_events import AgentTick
 from share.runtime.arrivals import (
@@ -142,12 +142,12 @@ def test_no_frame_is_late_without_a_limit_or_a_later_frame(late_ms: float, anoth
 
 
 def test_a_headset_with_an_imu_stays_fresh_by_default() -> None:
-    rig = rig_of()
-    assert late_limit_ms(None, AgentKind.AR, rig) == 100.0
-    assert late_limit_ms(None, AgentKind.AR, replace(rig, imu=None)) == 0.0
-    assert late_limit_ms(None, AgentKind.ROBOT, rig) == 0.0
-    assert late_limit_ms(0.0, AgentKind.AR, rig) == 0.0
-    assert late_limit_ms(50.0, AgentKind.ROBOT, rig) == 50.0
+    headset, robot = hello_of("ann", 1), hello_of("rob", 2, AgentKind.ROBOT)
+    assert late_limit_ms(None, headset) == 100.0
+    assert late_limit_ms(None, replace(headset, rig=replace(headset.rig, imu=None))) == 0.0
+    assert late_limit_ms(None, replace(headset, streams_frames=True)) == 0.0
+    assert late_limit_ms(None, robot) == late_limit_ms(0.0, headset) == 0.0
+    assert late_limit_ms(50.0, robot) == 50.0
 
 
 # ---------------------------------------------------------------- poses that come late
