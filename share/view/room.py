@@ -32,7 +32,7 @@ _FLASH_S, _TEXT_S = 1.5, 8.0  # how long a loop or correction, and a merge, stan
 _LEAST_CORRECTION_M = 0.005  # that is marked
 _FRUSTUM_M = 0.12  # size of a keyframe
 _FLOOR_STEP_M = 0.3  # a lower floor is not drawn again for less
-_FLOOR_MARGIN_M = 1.0
+_FLOOR_MARGIN_M, _MOST_SPARE_M = 1.0, 6.0
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -350,16 +350,18 @@ class Room:
         return None if (run := self.runs.get(key.agent)) is None else run.keyframes.get(key.id)
 
     def _new_floor(self) -> dr.Floor | None:
-        """Return the floor where it has to be drawn again: below the lowest points, as wide as the maps."""
+        """Return the floor where it has to be drawn again: below the lowest points, about as wide as the
+        maps."""
         if not self._lows:
             return None
         corners = np.array(list(self._lows.values()))
         z = float(np.percentile(corners[:, 2], 10))
         low, high = corners[:, :2].min(axis=0) - _FLOOR_MARGIN_M, corners[:, 3:].max(axis=0) + _FLOOR_MARGIN_M
         old = self._floor
-        covers = old is not None and (low >= old.low).all() and (high <= old.high).all()
-        if old is not None and covers and abs(z - old.z) < _FLOOR_STEP_M:
-            return None
+        if old is not None and abs(z - old.z) < _FLOOR_STEP_M:
+            spare = np.concatenate([low - old.low, old.high - high])  # on each side
+            if (spare >= 0).all() and (spare < _MOST_SPARE_M).all():
+                return None
         margin = 0.0 if old is None else 1.5  # it grows by steps
         low, high = np.floor(low - margin), np.ceil(high + margin)
         self._floor = dr.Floor(z, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))

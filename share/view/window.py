@@ -20,7 +20,7 @@ from share.vision.image_codec import decode_gray
 _MAX_MESSAGE_BYTES = 2**20  # from a browser, which sends its camera and what is chosen
 MAX_BROWSERS = 16
 _GREY = (110, 110, 110)
-_POINT_M = 0.04
+_POINT_M = 0.03
 _FRUSTUM_SIZE = 0.5
 _ROBOT_RADIUS_M, _ROBOT_HEIGHT_M = 0.17, 0.2  # a TurtleBot 4
 _PICTURE_PX = 160  # width

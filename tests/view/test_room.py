@@ -221,6 +221,20 @@ def test_a_merge_moves_one_map_into_the_other_and_is_announced() -> None:
     assert dr.Removed("/texts/merge") in told(room, now_s=20.0)
 
 
+def floors(drawings: Iterable[dr.Drawing]) -> list[dr.Floor]:
+    return [one for one in drawings if isinstance(one, dr.Floor)]
+
+
+def test_the_floor_is_as_wide_as_the_maps() -> None:
+    room = Room()
+    (first,) = floors(told(room, *one_agent("ann", "A")))
+    assert not floors(told(room, keyframe("ann", 1, 0.3)))
+    (wide,) = floors(told(room, *one_agent("bob", "B")))  # another map, beside it
+    assert wide.high[1] > first.high[1] + 5
+    (one_map,) = floors(told(room, corrected("bob", "A", at(0.5))))
+    assert one_map.high[1] < wide.high[1] - 5
+
+
 def test_the_last_map_stands_at_the_origin() -> None:
     room = two_maps()
     told(room, corrected("ann", "B", at(3.0)))
