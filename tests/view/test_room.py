@@ -228,7 +228,7 @@ def floors(drawings: Iterable[dr.Drawing]) -> list[dr.Floor]:
 def test_the_floor_is_as_wide_as_the_maps() -> None:
     room = Room()
     (first,) = floors(told(room, *one_agent("ann", "A")))
-    assert not floors(told(room, keyframe("ann", 1, 0.3)))
+    assert not floors(told(room, keyframe("ann", 1, 0.0)))
     (wide,) = floors(told(room, *one_agent("bob", "B")))  # another map, beside it
     assert wide.high[1] > first.high[1] + 5
     (one_map,) = floors(told(room, corrected("bob", "A", at(0.5))))
