@@ -30,7 +30,7 @@ _BACKLOG = 16
 
 
 @dataclass(frozen=True)
-class Refusal:
+class HttpRefusal:
     """An answer in place of what was asked for. headers: lines without their end."""
 
     status: HTTPStatus
@@ -46,30 +46,32 @@ class HttpGuard:
         self._cookie_name = f"share_{address.port}"
         self._cookie = "" if token is None else hashlib.sha256(f"cookie {token}".encode()).hexdigest()
 
-    def check(self, target: str, headers: Mapping[str, str]) -> Refusal | None:
+    def check(self, target: str, headers: Mapping[str, str]) -> HttpRefusal | None:
         """Return what to answer instead; None if the request is served.
 
         target: path and query. headers: by name in lower case.
         """
         host = headers.get("host")
         if self.is_local and host is not None and not _is_local_name(host):
-            return Refusal(HTTPStatus.FORBIDDEN, "only requests for the host name localhost are served")
+            return HttpRefusal(HTTPStatus.FORBIDDEN, "only requests for the host name localhost are served")
         if (origin := headers.get("origin")) is not None and not _is_same_origin(origin, host):
-            return Refusal(HTTPStatus.FORBIDDEN, "only pages of this server may read it")
+            return HttpRefusal(HTTPStatus.FORBIDDEN, "only pages of this server may read it")
         if self._token is None:
             return None
         path, query = urlsplit(target).path or "/", parse_qsl(urlsplit(target).query)
         if any(name == "token" and self._is_token(value) for name, value in query):  # off the address bar
             rest = urlencode([pair for pair in query if pair[0] != "token"])
             where = f"Location: {_own_path(path)}{'?' if rest else ''}{rest}"
-            return Refusal(HTTPStatus.SEE_OTHER, "go on without the token", (where, *self.cookie_headers()))
+            return HttpRefusal(
+                HTTPStatus.SEE_OTHER, "go on without the token", (where, *self.cookie_headers())
+            )
         if self._has_cookie(headers.get("cookie", "")) or self._is_authorised(
             headers.get("authorization", "")
         ):
             return None
         text = "a token is needed: open the address that the edge printed, or give the token as password"
         ask = 'WWW-Authenticate: Basic realm="SHARE: any name, the token as password", charset="UTF-8"'
-        return Refusal(HTTPStatus.UNAUTHORIZED, text, (ask,))
+        return HttpRefusal(HTTPStatus.UNAUTHORIZED, text, (ask,))
 
     def cookie_headers(self) -> tuple[str, ...]:
         """Return the header lines by which a browser, once served, is known; none without a token."""

@@ -94,3 +94,8 @@ def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) 
     if report["unacknowledged_ms"] > _UNACKNOWLEDGED_MS:
         out.append(f"a keyframe has waited {report['unacknowledged_ms'] / 1e3:.0f} s to be acknowledged")
     return out
+
+
+def trouble_lines(agents: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the troubles of all agents, by label, a line each."""
+    return [f"agent '{label}': {line}" for label, agent in agents.items() for line in agent["trouble"]]

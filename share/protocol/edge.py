@@ -20,7 +20,6 @@ from share.mapping.map_changes import MapChange, RemoveRun, SaveCredential, Save
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
-from share.protocol.agent_health import agent_troubles
 from share.protocol.edge_records import DurabilityTracker, EventLog
 from share.protocol.keyframe_intake import KeyframeQuota, OdometryBase, sanitise
 from share.protocol.peer import Peer, RestoredRun, Sender, fault_warnings
@@ -54,6 +53,7 @@ class Edge:
     ) -> None:
         self._config, self._session = config, session
         self._registry, self._unjoined = RunRegistry(), Sender()
+        self.latest_poses = self._registry.latest_poses
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self._admission = Admission(config.edge, self.tracks_agents)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
@@ -141,9 +141,7 @@ class Edge:
             return False
         if peer.is_gone and not self._comes_back(peer, message):
             return False
-        peer.last_received_ns, peer.has_sent = self._now_ns, True
-        if peer.joined_ns is None:
-            peer.joined_ns = self._now_ns
+        peer.mark_received(self._now_ns)
         if peer.credential != event.credential:  # it has changed, or was unknown
             peer.credential = event.credential
             self._effects.append(ed.SetCredential(peer.key, event.credential))
@@ -157,9 +155,7 @@ class Edge:
             case Keyframe():
                 self._on_keyframe(peer, message)
             case wire.PoseUpdate():
-                peer.counts["poses"] += 1
-                peer.status.add_pose(message.state, self._now_ns, message.age_ms)
-                peer.latest_pose = message
+                peer.add_pose(message, self._now_ns)
             case wire.Status():
                 peer.status.update(message, self._now_ns)
             case wire.Evaluation():
@@ -381,30 +377,20 @@ class Edge:
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         """Return the report of a run without what the mapper knows of it."""
         name = peer.name if self._registry.is_latest(peer) else None
-        report = peer.report(self._now_ns) | self._rate_scheduler.report(name, peer.hello.kind)
-        joined_s = 0.0 if peer.joined_ns is None else (self._now_ns - peer.joined_ns) * 1e-9
-        troubles = [] if peer.is_gone else agent_troubles(peer.hello.kind, report, joined_s)
-        return report | {"trouble": troubles}
-
-    def latest_poses(self) -> dict[str, wire.PoseUpdate]:
-        """Return the newest pose of each present run, by run key."""
-        present = (peer for peer in self._registry.values() if not peer.is_gone)
-        return {peer.key: peer.latest_pose for peer in present if peer.latest_pose is not None}
+        return peer.report(self._now_ns, self._rate_scheduler.report(name, peer.hello.kind))
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, whose `agents` are by run key. Runs
         go by `RunRegistry.label`."""
         peers, mapped = self._registry.values(), map_report.get("agents", {})
-        agents = {
-            self._registry.label(peer): self._peer_report(peer) | mapped.get(peer.key, {}) for peer in peers
-        }
-        troubles = ((label, line) for label, agent in agents.items() for line in agent["trouble"])
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
             **map_report,
-            "agents": agents,
-            "agent_trouble": [f"agent '{label}': {line}" for label, line in troubles],
+            "agents": {
+                self._registry.label(peer): self._peer_report(peer) | mapped.get(peer.key, {})
+                for peer in peers
+            },
             "unjoined": dict(self._unjoined.counts),
             "refused": fault_warnings(peers, self._unjoined, self._now_ns),
             "internal_errors": self._internal_errors,

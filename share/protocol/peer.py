@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,7 @@ from share.geometry import se3
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredMap, map_poses
-from share.protocol.agent_health import PoseAges
+from share.protocol.agent_health import PoseAges, agent_troubles
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import TrackState
@@ -163,12 +163,23 @@ class Peer(Sender):
         is_full = self.pending_saves >= _MAX_PENDING_SAVES
         return f"{self.pending_saves} keyframes wait for the disk" if is_full else None
 
-    def report(self, now_ns: int) -> dict[str, Any]:
-        """Return the fields of edge.json that come from the run's messages."""
+    def mark_received(self, now_ns: int) -> None:
+        """Record that it has sent a message."""
+        self.last_received_ns, self.has_sent = now_ns, True
+        if self.joined_ns is None:
+            self.joined_ns = now_ns
+
+    def add_pose(self, pose: PoseUpdate, now_ns: int) -> None:
+        self.counts["poses"] += 1
+        self.status.add_pose(pose.state, now_ns, pose.age_ms)
+        self.latest_pose = pose
+
+    def report(self, now_ns: int, rating: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the fields of edge.json that come from the run's messages. rating: of `RateScheduler`."""
         status = self.status.report(now_ns, self.last_received_ns if self.has_sent else None)
         if self.overload.is_recent(now_ns, _OVERLOAD_SHOWN_S):
             status["reason"] = "; ".join(filter(None, (status["reason"], self.overload.reason)))
-        return {
+        report = {
             "kind": str(self.hello.kind),
             "run": self.key,
             **status,
@@ -178,7 +189,11 @@ class Peer(Sender):
             "last_refusal": self.refusals.reason or None,
             "suspect_keyframes": self.suspect_keyframes.count,
             "last_suspicion": self.suspect_keyframes.reason or None,
+            **rating,
         }
+        joined_s = 0.0 if self.joined_ns is None else (now_ns - self.joined_ns) * 1e-9
+        troubles = [] if self.is_gone else agent_troubles(self.hello.kind, report, joined_s)
+        return report | {"trouble": troubles}
 
 
 def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list[str]:

@@ -23,6 +23,7 @@ from share.config import Config
 from share.errors import StoreError
 from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
+from share.protocol.agent_health import trouble_lines
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
     AddKeyframe,
@@ -205,6 +206,7 @@ class EdgeRun:
             "refused": [*self._other_troubles.current(), *report["refused"]],
             "refused_handshakes": self._refused_handshakes.total(),
             "trouble": [*self._troubles.current(), *filter(None, current)],
+            "agent_trouble": trouble_lines(report["agents"]),
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
             **self._progress.last_solve(),
         }

@@ -62,7 +62,7 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Floor:
+class FloorGrid:
     """Height of the floor, m, and what it has to carry: least and largest x and y."""
 
     z: float
@@ -85,4 +85,4 @@ class Announcement:
     text: str
 
 
-Drawing = Points | Lines | Body | Picture | Text | Floor | Removed | Announcement
+Drawing = Points | Lines | Body | Picture | Text | FloorGrid | Removed | Announcement

@@ -15,11 +15,12 @@ from itertools import pairwise
 import numpy as np
 
 from share.mapping.loops import KeyframeKey
-from share.types import F32, F64, AgentKind
+from share.types import F64
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
 from share.view.loop_lines import LoopLines
+from share.view.shapes import frusta, lines, named, shifted
 
 COLOURS: tuple[dr.Colour, ...] = (  # of agents, told apart also by those who see few colours (Okabe and Ito)
     *((86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66)),
@@ -30,10 +31,8 @@ _MAP_SPACING_M = 10.0  # between maps that are not joined
 _MAX_CHUNKS = 12  # drawn at a time
 _FLASH_S, _TEXT_S = 1.5, 8.0  # how long a loop or correction, and a merge, stand out
 _LEAST_CORRECTION_M = 0.005  # that is marked
-_FRUSTUM_M = 0.12  # size of a keyframe
 _FLOOR_STEP_M = 0.3  # a lower floor is not drawn again for less
 _FLOOR_MARGIN_M, _MOST_SPARE_M = 1.0, 6.0
-_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Room:
         self._moved_runs: set[str] = set()
         self._pictures: dict[str, bytes] = {}
         self._lows: dict[str, F64] = {}  # corner and floor of each chunk of keyframes: x, y, z, x, y
-        self._floor: dr.Floor | None = None
+        self._floor: dr.FloorGrid | None = None
         self._said: list[dr.Announcement] = []
 
     # ------------------------------------------------------------------ events
@@ -138,7 +137,7 @@ class Room:
         if moved_m >= _LEAST_CORRECTION_M:
             ends = np.array([[before[1][:3, 3], after[1][:3, 3]]]) + self._offset(after[0])
             self._show_for(
-                f"/corrections/{run.number}", _lines(ends, _CORRECTION_COLOUR, 5.0), now_s, _FLASH_S
+                f"/corrections/{run.number}", lines(ends, _CORRECTION_COLOUR, 5.0), now_s, _FLASH_S
             )
 
     def _solve(self, event: ev.MapsSolved) -> None:
@@ -158,7 +157,7 @@ class Room:
         self._mark_loops({chunk})
         if (ends := self._loop_ends([(a, b)])) is not None:
             self._show_for(
-                f"/loops/new/{self._loops.count}", _lines(ends, _FLASH_COLOUR, 6.0), now_s, _FLASH_S
+                f"/loops/new/{self._loops.count}", lines(ends, _FLASH_COLOUR, 6.0), now_s, _FLASH_S
             )
 
     def _remove_keyframe(self, key: KeyframeKey) -> None:
@@ -221,8 +220,8 @@ class Room:
     def _show_for(self, name: str, thing: dr.Lines | dr.Text, now_s: float, duration_s: float) -> None:
         """Show something for a while."""
         self._temporary[name] = now_s + duration_s
-        named: list[dr.Drawing] = [_named(thing, name)]
-        self._dirty[name] = lambda: named
+        shown: list[dr.Drawing] = [named(thing, name)]
+        self._dirty[name] = lambda: shown
 
     def _arrange_maps(self) -> None:
         """Give each map its place: the first at the origin, the others beside it."""
@@ -281,7 +280,7 @@ class Room:
     def agent_place(self, run_key: str) -> F64 | None:
         """Return T_room_body (4, 4) of a run; None if unknown."""
         place = None if (run := self.runs.get(run_key)) is None else run.place()
-        return None if place is None else _shifted(place[1], self._offset(place[0]))
+        return None if place is None else shifted(place[1], self._offset(place[0]))
 
     def colour(self, run: RunPath) -> dr.Colour:
         """Return the colour of an agent: that of its first run."""
@@ -292,7 +291,7 @@ class Room:
         if (place := run.place()) is None:
             return None
         shown = run.shown
-        T, is_current = _shifted(place[1], self._offset(place[0])), run.state.has_pose and run.is_current
+        T, is_current = shifted(place[1], self._offset(place[0])), run.state.has_pose and run.is_current
         name, colour = f"/agents/{run.number}", self.colour(run)
         self._drawn.add(name)
         return dr.Body(
@@ -308,7 +307,7 @@ class Room:
         origin = T[:, :3, 3].mean(axis=0)
         T[:, :3, 3] -= origin
         if kind == "keyframes":
-            return [dr.Lines(name, origin, _frusta(T, run.shown), self.colour(run), 1.5)]
+            return [dr.Lines(name, origin, frusta(T, run.shown), self.colour(run), 1.5)]
         points = np.concatenate(
             [one.points @ R.T + t for (one, _), R, t in zip(placed, T[:, :3, :3], T[:, :3, 3], strict=True)]
         )
@@ -325,11 +324,11 @@ class Room:
         points = np.array([position + self._offset(map_id) for map_id, position in placed])
         same_map = np.array([a[0] == b[0] for a, b in pairwise(placed)])
         segments = np.stack([points[:-1], points[1:]], axis=1)[same_map]
-        return [_named(_lines(segments, self.colour(run), 3.0), name)] if len(segments) else []
+        return [named(lines(segments, self.colour(run), 3.0), name)] if len(segments) else []
 
     def _draw_loops(self, chunk: int, name: str) -> list[dr.Drawing]:
         ends = self._loop_ends(self._loops.chunk(chunk))
-        return [] if ends is None else [_named(_lines(ends, _LOOP_COLOUR, 2.0), name)]
+        return [] if ends is None else [named(lines(ends, _LOOP_COLOUR, 2.0), name)]
 
     def _loop_ends(self, loops: Iterable[tuple[KeyframeKey, KeyframeKey]]) -> F64 | None:
         """Return the ends (N, 2, 3) of loops whose keyframes are placed; None without one."""
@@ -344,12 +343,12 @@ class Room:
         """Return the pose (4, 4) of a keyframe in the room; None if unknown."""
         if one is None or one.T_map_body is None:
             return None
-        return _shifted(one.T_map_body, self._offset(one.map_id))
+        return shifted(one.T_map_body, self._offset(one.map_id))
 
     def _keyframe(self, key: KeyframeKey) -> PlacedKeyframe | None:
         return None if (run := self.runs.get(key.agent)) is None else run.keyframes.get(key.id)
 
-    def _new_floor(self) -> dr.Floor | None:
+    def _new_floor(self) -> dr.FloorGrid | None:
         """Return the floor where it has to be drawn again: below the lowest points, about as wide as the
         maps."""
         if not self._lows:
@@ -364,40 +363,13 @@ class Room:
                 return None
         margin = 0.0 if old is None else 1.5  # it grows by steps
         low, high = np.floor(low - margin), np.ceil(high + margin)
-        self._floor = dr.Floor(z, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+        self._floor = dr.FloorGrid(z, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
         return self._floor
 
     @property
-    def floor(self) -> dr.Floor | None:
+    def floor(self) -> dr.FloorGrid | None:
         return self._floor
 
 
 def _nothing() -> list[dr.Drawing]:
     return []
-
-
-def _shifted(T: F64, offset: F64) -> F64:
-    out = T.copy()
-    out[:3, 3] += offset
-    return out
-
-
-def _lines(ends: F64, colour: dr.Colour, width: float) -> dr.Lines:
-    origin = ends.reshape(-1, 3).mean(axis=0)
-    return dr.Lines("", origin, (ends - origin).astype(np.float32), colour, width)
-
-
-def _named(thing: dr.Lines | dr.Text, name: str) -> dr.Lines | dr.Text:
-    if isinstance(thing, dr.Text):
-        return dr.Text(name, thing.text, thing.position)
-    return dr.Lines(name, thing.origin, thing.segments, thing.colour, thing.width)
-
-
-def _frusta(T: F64, shown: ev.RunShown) -> F32:
-    """Return the edges (8 N, 2, 3) of N frusta of bodies T (N, 4, 4)."""
-    size = _FRUSTUM_M * (1.0 if shown.kind is AgentKind.AR else 0.8)
-    in_camera = np.vstack([np.zeros(3), np.column_stack([_CORNERS * shown.half_angles, np.ones(4)]) * size])
-    in_body = in_camera @ shown.T_body_cam0[:3, :3].T + shown.T_body_cam0[:3, 3]
-    points = np.einsum("nij,kj->nki", T[:, :3, :3], in_body) + T[:, None, :3, 3]
-    edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
-    return np.asarray(points[:, edges].reshape(-1, 2, 3), np.float32)

@@ -50,7 +50,7 @@ class Window:
         self._colours: dict[str, tuple[dr.Colour, str]] = {}
         self._cameras: dict[int, _BrowserCamera] = {}
         self._followed: tuple[str, ...] = ()
-        self._floor: dr.Floor | None = None
+        self._floor: dr.FloorGrid | None = None
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
 
@@ -103,7 +103,7 @@ class Window:
                 self._draw_picture(one)
             case dr.Text():
                 scene.add_label(one.name, one.text, position=one.position, font_screen_scale=1.3)
-            case dr.Floor():
+            case dr.FloorGrid():
                 self._draw_floor(one)
             case dr.Removed():
                 self._frames.pop(one.name, None)
@@ -158,7 +158,7 @@ class Window:
         if handle is not None and (image := _small_picture(picture.jpeg)) is not None:
             handle.image = image
 
-    def _draw_floor(self, floor: dr.Floor) -> None:
+    def _draw_floor(self, floor: dr.FloorGrid) -> None:
         self._floor = floor
         (x0, y0), (x1, y1) = floor.low, floor.high
         self._server.scene.add_grid(
@@ -198,7 +198,7 @@ class _BrowserCamera:
         self._agents = agents
         self._choice = client.gui.add_dropdown("camera", _choices(agents), initial_value=_ORBIT, order=-1.0)
         self._choice.on_update(lambda _: self._choose())
-        self._floor: dr.Floor | None = None
+        self._floor: dr.FloorGrid | None = None
         self._set_position: F64 | None = None  # that this program chose last
         self._last: F64 | None = None  # of the agent that is followed
 
@@ -208,7 +208,7 @@ class _BrowserCamera:
             self._choice.options = _choices(agents)
             self._choice.value = chosen if chosen in _choices(agents) else _ORBIT
 
-    def look_at_room(self, floor: dr.Floor | None) -> None:
+    def look_at_room(self, floor: dr.FloorGrid | None) -> None:
         """Show all of the room, unless its user has moved the camera."""
         self._floor = floor
         is_own = self._set_position is None or bool(
@@ -256,7 +256,7 @@ def _choices(agents: Sequence[str]) -> tuple[str, ...]:
     return (_ORBIT, _ABOVE, *(f"{_FOLLOW}{name}" for name in agents))
 
 
-def _extent(floor: dr.Floor) -> tuple[F64, float]:
+def _extent(floor: dr.FloorGrid) -> tuple[F64, float]:
     """Return the centre (3,) and the diagonal of a room."""
     low, high = np.array([*floor.low, floor.z]), np.array([*floor.high, floor.z])
     return (low + high) / 2 + (0.0, 0.0, 0.8), float(np.linalg.norm(high - low))

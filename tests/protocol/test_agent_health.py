@@ -10,7 +10,7 @@ from helpers.hellos import hello_of
 from helpers.model_edge import MS, S
 
 from share.config import Config
-from share.protocol.agent_health import PoseAges, agent_troubles
+from share.protocol.agent_health import PoseAges, agent_troubles, trouble_lines
 from share.protocol.edge import Edge
 from share.protocol.edge_events import EdgeTick, PeerMessageReceived
 from share.types import AgentKind, TrackState
@@ -94,7 +94,7 @@ def test_an_edge_sees_how_late_the_poses_of_a_headset_are() -> None:
     edge = edge_with(wire.Status(TrackState.OK, 3400.0), *poses)
     report = edge.report({})
     assert report["agents"]["ann"]["trouble"] == ["poses come 3.4 s, limit 20 ms"]
-    assert report["agent_trouble"] == ["agent 'ann': poses come 3.4 s, limit 20 ms"]
+    assert trouble_lines(report["agents"]) == ["agent 'ann': poses come 3.4 s, limit 20 ms"]
     assert edge.latest_poses()[report["agents"]["ann"]["run"]].stamp_ns == 19
 
 
@@ -109,4 +109,4 @@ def test_low_quality_of_experience_counts_from_its_first_evaluation() -> None:
 def test_who_left_is_in_no_trouble() -> None:
     edge = edge_with(wire.Status(TrackState.LOST, 3.0, "lost for 1 s"), wire.Bye())
     edge.handle(EdgeTick(), 60 * S)
-    assert edge.report({})["agent_trouble"] == [] and edge.latest_poses() == {}
+    assert trouble_lines(edge.report({})["agents"]) == [] and edge.latest_poses() == {}

@@ -80,7 +80,7 @@ def test_a_keyframe_is_drawn_once_its_place_is_known() -> None:
     (points,) = of(drawings, "/points/0/0")
     assert isinstance(points, dr.Points)
     np.testing.assert_allclose(points.points + points.origin, POINTS + np.array([11.0, 0, 0]), atol=1e-5)
-    assert len(of(drawings, "/keyframes/0/0")) == 1 and any(isinstance(one, dr.Floor) for one in drawings)
+    assert len(of(drawings, "/keyframes/0/0")) == 1 and any(isinstance(one, dr.FloorGrid) for one in drawings)
 
 
 def test_nothing_is_drawn_where_nothing_changed() -> None:
@@ -221,8 +221,8 @@ def test_a_merge_moves_one_map_into_the_other_and_is_announced() -> None:
     assert dr.Removed("/texts/merge") in told(room, now_s=20.0)
 
 
-def floors(drawings: Iterable[dr.Drawing]) -> list[dr.Floor]:
-    return [one for one in drawings if isinstance(one, dr.Floor)]
+def floors(drawings: Iterable[dr.Drawing]) -> list[dr.FloorGrid]:
+    return [one for one in drawings if isinstance(one, dr.FloorGrid)]
 
 
 def test_the_floor_is_as_wide_as_the_maps() -> None:
