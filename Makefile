@@ -5,15 +5,22 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
 .PHONY: install demo test unit lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures docs
 
+CHECK_PYTHON := $(PYTHON) -c "import sys; v = sys.version_info; v >= (3, 11) or sys.exit('SHARE needs Python 3.11 or newer; $(PYTHON) is %d.%d. Name another: make PYTHON=/path/to/python3.11' % v[:2])"
+
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
-	@$(PYTHON) -c "import sys; v = sys.version_info; v >= (3, 11) or sys.exit('SHARE needs Python 3.11 or newer; $(PYTHON) is %d.%d. Name another: make PYTHON=/path/to/python3.11' % v[:2])"
+	@$(CHECK_PYTHON)
 	$(PYTHON) -m venv .venv
 	$(PIP) -e '.[dev]'
 	touch $@
 
-demo: install
+demo: .venv/for-demo  # without the developers' tools
 	$(BIN)/share demo
+.venv/for-demo: setup.cfg pyproject.toml
+	@$(CHECK_PYTHON)
+	@test -e .venv || $(PYTHON) -m venv .venv
+	$(BIN)/pip install --disable-pip-version-check -e '.[emulate,view]'
+	touch $@
 unit: install  # the inner loop: what decides, without what takes a second or more
 	$(BIN)/pytest -n auto --maxprocesses 4 -m "not slow and not torture and not long" tests/geometry tests/vision tests/scheduling tests/metrics tests/wire tests/sensors tests/protocol tests/mapping tests/odometry
 test: install

@@ -68,14 +68,14 @@ class AgentConfig:
     """The agent: keyframes, corrections, error model."""
 
     keep_keyframes: int = 600  # keyframes kept, sent ones included, to resend to a restarted edge
-    late_ms: float = 0.0  # frames later than this are skipped; 0: none
+    late_ms: float | None = None  # later frames get a pose from the IMU; 0: none; null: 100 for a headset
     blend_s: float = 0.5  # time constant with which the pose follows a correction
     finish_s: float = 5.0  # longest wait for acknowledgements at the end of a run
     error_model: str = "shipped"  # error model: shipped, a file, or "" for odometry's covariance
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")
-        if not self.late_ms >= 0:
+        if self.late_ms is not None and not self.late_ms >= 0:
             raise ValueError(f"late_ms: {self.late_ms} must not be negative")
 
 

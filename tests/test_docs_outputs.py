@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any, get_args
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 from helpers.edge_sim import Person, Town, walls
 from helpers.hellos import hello_of
@@ -29,13 +30,14 @@ from share.protocol.streaming import StreamingAgent
 from share.recordings.losses import DataLosses
 from share.runtime import edge, mapper_process
 from share.runtime.edge import EdgeRun
+from share.runtime.edge_metrics import METRICS, render_metrics
 from share.runtime.frame_consumers import RemoteTracking
 from share.runtime.offline_tracking import track
-from share.runtime.status_server import METRICS, StatusServer, render_metrics
+from share.runtime.status_server import StatusServer
 from share.runtime.worker_process import END, Inbox
 from share.types import TrackState
 from share.wire.codec import encode
-from share.wire.messages import Evaluation, Status, peer_id
+from share.wire.messages import Evaluation, PoseUpdate, Status, peer_id
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES, STATUS = ((ROOT / "docs" / "lookup" / name).read_text() for name in ("files.md", "status.md"))
@@ -167,7 +169,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     town = Town([Person("ann", room, 0.0, 11), Person("bob", room, 0.1, 22)])
     town.walk(4)
     messages: list[tuple[int, Any]] = [(11, hello_of("ann", 11)), (22, hello_of("bob", 22))]
-    messages += [(11, Evaluation(0, 20.0, 0.1)), (11, Status(TrackState.OK, 3.0, ""))]
+    messages += [(11, Evaluation(0, 20.0, 0.1)), (11, Status(TrackState.OK, 3.0, "", 0.0, 0.5))]
+    messages.append((11, PoseUpdate(1, TrackState.OK, -1, np.eye(4), 5.0)))
     messages += [(run, k) for run, name in ((11, "ann"), (22, "bob")) for k in town.keyframes(name)]
     with pytest.MonkeyPatch.context() as patch:
         for module in (edge, mapper_process):

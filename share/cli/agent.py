@@ -268,7 +268,7 @@ def _summary(run: AgentRun) -> str:
     else:
         lines += [keyframes_text(r, traffic)]
     if r["dropped_late"]:
-        lines.append(f"{r['dropped_late']} more frames dropped to keep up")
+        lines.append(f"{r['dropped_late']} frames came too late to be tracked{_late_text(r)}")
     if r["late_frames"]:
         lines.append(f"{r['late_frames']} poses were late, by up to {r['max_late_s']:.1f} s")
     if p95 is not None:
@@ -276,6 +276,11 @@ def _summary(run: AgentRun) -> str:
     if r["clock"]["uncertainty_ms"] is not None:
         lines.append(f"clock of the edge: {clock_text(r['clock'])}")
     return "\n".join([*lines, *camera_options.camera_summary(r)])
+
+
+def _late_text(r: dict[str, Any]) -> str:
+    """Return what became of late frames."""
+    return " and were left out" if "untracked" in r else ": their poses are the IMU's predictions"
 
 
 def keyframes_text(r: dict[str, Any], traffic: str) -> str:

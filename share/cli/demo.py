@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from share.cli import options
+from share.cli.live_pages import live_pages
 from share.cli.terminal import Column, LiveLine, Stages, column_table
 from share.config import STREAMED
 from share.errors import UsageError
@@ -39,6 +41,7 @@ class _Seconds(click.FloatRange):
 @click.option(
     "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
 )
+@click.option("--view/--no-view", default=True, help="Show the room live in a browser, in 3D.")
 def demo(
     seconds: float,
     policy: str | None,
@@ -48,12 +51,13 @@ def demo(
     out: Path,
     scene: str | None,
     seed: int | None,
+    view: bool,
 ) -> None:
     """Try the whole system on this machine; nothing else is needed.
 
     Makes a virtual room with two headset wearers and a robot (cached for the next time), plays it in real
     time to an edge and three agents, each its own process, and shows how accurately the agents knew their
-    poses in the shared map.
+    poses in the shared map. Meanwhile a browser shows the map as it grows.
 
     \b
     Example:  share demo --seconds 30 --out /tmp/demo
@@ -69,7 +73,7 @@ def demo(
     from share.lab.emulate.session import make_cached_session
     from share.lab.evaluate.emulated_network import LinkAssignment
     from share.lab.evaluate.real_time import RunOptions, play_in_real_time
-    from share.lab.evaluate.scoring import score_session
+    from share.lab.evaluate.scoring import join_times, score_session
     from share.recordings.session import read_session
 
     LinkAssignment.parse(link).check(DEMO_AGENTS)
@@ -87,10 +91,12 @@ def demo(
         config=None if config_file is None else str(config_file),
         agents_first=True,
     )
-    folders = play_in_real_time(session, seconds, run_terms, out, lambda now: live.write(str(now)))
+    pages = live_pages(live) if view else None
+    folders = play_in_real_time(session, seconds, run_terms, out, lambda now: live.write(str(now)), pages)
     live.end()
     result = score_session(session, folders)
-    click.echo(_score_table(result, policy == STREAMED))
+    since_s = join_times(out / "edge" / "events.jsonl")
+    click.echo(_score_table(result, since_s, policy == STREAMED))
     if core_count() <= len(folders):
         warning = (
             f"{len(folders)} agents and the edge shared {core_count()} cores, so frames waited; on separate "
@@ -121,8 +127,13 @@ def _renderable_scene(scene: str | None) -> str:
     return DEFAULT_SCENE if missing_renderer is None else FALLBACK_SCENE
 
 
-def _score_table(result: SessionScore, streamed: bool) -> str:
+def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool) -> str:
+    """since_s: when each agent came to share a map, s since the first one joined."""
     joint = {} if result.joint is None else result.joint.agents
+
+    def coverage(ates: Mapping[str, Ate | None]) -> Column:
+        """Return a column with the share of an agent's frames that its error is about."""
+        return "of frames", lambda agent: _percent(ates.get(agent), result.agents[agent].report["frames"])
 
     def duration(title: str, name: str, percentile: str) -> Column:
         return title, lambda agent: _ms(result.agents[agent].report[name][percentile])
@@ -133,7 +144,10 @@ def _score_table(result: SessionScore, streamed: bool) -> str:
     columns: tuple[Column, ...] = (
         ("agent", str),
         ("odom ATE", lambda agent: _cm(result.agents[agent].odometry)),
+        coverage({name: agent.odometry for name, agent in result.agents.items()}),
+        ("in the map since", lambda agent: f"{since_s[agent]:.1f} s" if agent in since_s else "–"),
         ("map ATE", lambda agent: _cm(joint.get(agent))),
+        coverage(joint),
         duration("pose p50", "track_ms", "p50"),
         duration("p95", "track_ms", "p95"),
         ("> 20 ms", lambda agent: f"{100 * result.agents[agent].report['over_20ms']:.1f} %"),
@@ -157,6 +171,10 @@ def _score_table(result: SessionScore, streamed: bool) -> str:
 
 def _cm(ate: Ate | None) -> str:
     return "–" if ate is None else f"{100 * ate.rmse:.2f} cm"
+
+
+def _percent(ate: Ate | None, frames: int) -> str:
+    return "–" if ate is None else f"{100 * ate.n / frames:.0f} %"
 
 
 def _ms(value: float | None) -> str:

@@ -16,7 +16,9 @@ from share.event_kinds import EventKind
 if TYPE_CHECKING:
     from share.cli.stderr import Stderr
     from share.net.keys import EdgeKeys
+    from share.runtime.edge import EdgeRun
     from share.store.map_store import MapStore
+    from share.view.viewer import LiveRoom
 
 
 @click.command()
@@ -33,6 +35,13 @@ if TYPE_CHECKING:
 @click.option(
     "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
 )
+@click.option("--view", metavar="[H:]P", help="Show the room live in 3D here (needs viser).")
+@click.option(
+    "--http-token",
+    metavar="FILE",
+    type=options.PATH,
+    help="Ask for the token in this file, made if it is not there; needed to serve other machines.",
+)
 @click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
 @options.config
 @options.verbose
@@ -43,6 +52,8 @@ def edge(
     keys: Path | None,
     map_file: Path | None,
     http: str | None,
+    view: str | None,
+    http_token: Path | None,
     out: Path | None,
     config_file: Path | None,
     verbose: bool,
@@ -56,18 +67,22 @@ def edge(
     With --map, every keyframe that the edge acknowledged survives a crash; the next start continues there.
 
     \b
-    Example:  share edge --bind tcp://127.0.0.1:5555 --map room.sqlite --http 8080 --out out/edge
+    Example:  share edge --bind tcp://127.0.0.1:5555 --map room.sqlite --http 8080 --view 8081
     """
     settings = options.load_config(config_file, [policy])
     from contextlib import ExitStack, closing
+    from functools import partial
 
     from share.cli.stderr import Stderr
+    from share.net.http_guard import read_token
     from share.net.keys import edge_keys_for
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
+    from share.runtime.plan import Plan
     from share.runtime.signals import stop_on_signal
     from share.runtime.status_server import StatusServer
+    from share.view.viewer import LiveRoom
     from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     edge_key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
@@ -75,27 +90,58 @@ def edge(
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
+    if http_token is not None and http is None and view is None:
+        raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
+    password = "" if http_token is None else f"  (any name; the password is in {http_token})"
+    token = None if http_token is None else read_token(http_token)
     runs: list[EdgeRun] = []
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
-        status = None
+        status, rooms, plans = None, list[LiveRoom](), list[Plan]()
         if http is not None:  # before any process starts: the port may be in use
-            status = stack.enter_context(
-                closing(StatusServer(http, lambda: runs[0].report() if runs else {}, stderr.print_line))
-            )
+            plans.append(Plan())
+            shown = partial(_shown_report, runs, rooms)
+            server = StatusServer(http, shown, stderr.print_line, token, plans[0].report)
+            status = stack.enter_context(closing(server))
+        if view is not None:
+            rooms.append(stack.enter_context(closing(_open_room(view, token, stderr))))
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         run = stack.enter_context(
-            closing(EdgeRun(settings, link, out, lambda e: _print_event(stderr, e, verbose), store))
+            closing(
+                EdgeRun(
+                    settings,
+                    link,
+                    out,
+                    lambda e: _print_event(stderr, e, verbose),
+                    store,
+                    [*plans, *(room.feed for room in rooms)],
+                )
+            )
         )
         runs.append(run)
         with stop_on_signal(run.stop):
             stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}")
             _print_keys(stderr, edge_key_pair)
             if status is not None:
-                stderr.print_line(f"status at http://{status.endpoint}/")
+                stderr.print_line(f"status at http://{status.endpoint}/{password}")
+            for room in rooms:
+                stderr.print_line(f"live room at http://{room.endpoint}/{password}")
             report = run.run()
     click.echo(json.dumps(report) if as_json else _summary(report))
+
+
+def _open_room(address: str, token: str | None, stderr: Stderr) -> LiveRoom:
+    """Start the live room. Raises UsageError, TransportError."""
+    from share.view.viewer import LiveRoom
+
+    return LiveRoom(address, token, "SHARE edge", stderr.print_line)
+
+
+def _shown_report(runs: list[EdgeRun], rooms: list[LiveRoom]) -> dict[str, Any]:
+    """Return the report of the edge that runs, if it does yet, with the address of its live room."""
+    report = runs[0].report() if runs else {}
+    return report | {"live_room": rooms[0].endpoint} if rooms else report
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:

@@ -13,7 +13,9 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
+from share.cli.live_pages import live_pages
 from share.cli.terminal import Column, LiveLine, column_table
+from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.lab.evaluate.run_metrics import AgentMetrics, RunMetrics
@@ -37,6 +39,7 @@ def evaluate() -> None:
 @options.policy
 @options.run_options
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of link and scheduler.")
+@click.option("--view", is_flag=True, help="Show the room live in a browser; not with --virtual.")
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=options.PATH, help="A new folder.")
 @options.as_json
@@ -44,6 +47,7 @@ def run(
     session: Path,
     policy: str | None,
     seed: int,
+    view: bool,
     config_file: Path | None,
     out: Path,
     as_json: bool,
@@ -64,10 +68,13 @@ def run(
     from share.lab.evaluate.trial import run_trial
     from share.recordings.session import read_session
 
+    if view and options_given["virtual"]:
+        raise UsageError("--view shows a run in real time; leave it or --virtual out")
     opened, live = read_session(session), LiveLine()
     config = options.load_run_config(config_file, [policy], options_given, [opened])
     run_terms = RunOptions(config.edge.policy, seed=seed, **options_given)
-    trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)))
+    pages = live_pages(live) if view else None
+    trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)), pages)
     live.end()
     metrics = run_metrics(trial)
     document = {"protocol": PROTOCOL, "runs": [_run_document(metrics, trial)]}

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,8 +17,10 @@ from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
-    from share.runtime.offline_tracking import TrackingOutput
+    from share.recordings.trajectory import Trajectory
+    from share.runtime.offline_tracking import OfflineFrame, TrackingOutput
     from share.runtime.source import Source
+    from share.view.viewer import LiveRoom
 
 _LONG_INIT_S = 1.0  # a first pose later than this is reported
 
@@ -33,6 +38,7 @@ _LONG_INIT_S = 1.0  # a first pose later than this is reported
 @click.option(
     "--report", "report_file", metavar="R.json", type=options.PATH, help="File for the report (JSON)."
 )
+@click.option("--view", is_flag=True, help="Show it in 3D in a browser, until Ctrl-C (needs viser).")
 @camera_options.camera_options
 @options.config
 @options.verbose
@@ -43,6 +49,7 @@ def track(
     frames: slice | None,
     out: Path | None,
     report_file: Path | None,
+    view: bool,
     camera: camera_options.CameraOptions,
     config_file: Path | None,
     verbose: bool,
@@ -56,14 +63,10 @@ def track(
 
     \b
     Example:  share track rec/kitchen --out kitchen.tum --report kitchen.json
-              share track realsense --out walk.tum
+              share track realsense --out walk.tum --view
     """
     settings = options.load_config(config_file)
     paths_given = {"--out": out, "--report": report_file}
-    from share.files.writing import atomic_write
-    from share.metrics.ate import ate_if_known
-    from share.recordings.trajectory import format_tum
-
     line = LiveLine()
     opened = camera_options.open_source(
         source, calib, frames, camera, lambda text: line.print_line(f"share: {text}")
@@ -71,8 +74,31 @@ def track(
     options.print_notes(opened)
     output_files = _output_files(paths_given, source)
     truth = opened.truth()  # read now: if it is damaged, fail before tracking
-    run = _run_tracker(opened, settings, line)
-    line.end()
+    room = _open_room(opened, line) if view else None
+    try:
+        run = _run_tracker(opened, settings, line, room)
+        line.end()
+        _report(opened, run, truth, output_files, verbose, as_json)
+        if room is not None:
+            _wait_for_interrupt(line, room)
+    finally:
+        if room is not None:
+            room.close()
+
+
+def _report(
+    opened: Source,
+    run: TrackingOutput,
+    truth: Trajectory | None,
+    output_files: dict[str, Path],
+    verbose: bool,
+    as_json: bool,
+) -> None:
+    """Write the files and print the summary. Raises DataError if no frame could be tracked."""
+    from share.files.writing import atomic_write
+    from share.metrics.ate import ate_if_known
+    from share.recordings.trajectory import format_tum
+
     options.print_losses(opened)
     if not len(run.trajectory.stamps_ns):
         raise DataError(
@@ -109,7 +135,36 @@ def _output_files(paths_given: dict[str, Path | None], source: str) -> dict[str,
     return files
 
 
-def _run_tracker(opened: Source, settings: Config, line: LiveLine) -> TrackingOutput:
+def _open_room(opened: Source, line: LiveLine) -> LiveRoom:
+    """Start the live room. Raises UsageError where viser is missing."""
+    from share.view.viewer import LiveRoom
+
+    room = LiveRoom("0", None, opened.name, line.print_line)
+    line.print_line(f"live view at http://{room.endpoint}/")
+    return room
+
+
+def _wait_for_interrupt(line: LiveLine, room: LiveRoom) -> None:
+    """Keep the page until Ctrl-C."""
+    from share.runtime.signals import stop_on_signal
+
+    ended = Event()
+    with stop_on_signal(ended.set):
+        line.print_line(f"the page at http://{room.endpoint}/ stays until Ctrl-C")
+        ended.wait()
+
+
+def _watcher(opened: Source, room: LiveRoom | None) -> Callable[[OfflineFrame], None]:
+    """Return what shows each frame in the live room."""
+    if room is None:
+        return lambda step: None
+    from share.view.tracking import TrackedAgent
+
+    agent = TrackedAgent(room.feed, opened.name, opened.rig)
+    return lambda step: agent.add(step.result, step.candidate, 1e3 * step.track_s, time.monotonic())
+
+
+def _run_tracker(opened: Source, settings: Config, line: LiveLine, room: LiveRoom | None) -> TrackingOutput:
     """Track a whole recording, or a camera until a signal ends it."""
     from share.cameras.live import LiveSource
     from share.runtime.offline_tracking import track
@@ -120,9 +175,10 @@ def _run_tracker(opened: Source, settings: Config, line: LiveLine) -> TrackingOu
 
     if not isinstance(opened, LiveSource):
         with progress(opened.images_count, "tracking") as bar:
-            return track(opened, settings, lambda result: bar(1), print_line)
+            return track(opened, settings, lambda result: bar(1), print_line, _watcher(opened, room))
+    show = camera_options.TrackLine(opened.feed, line)
     with stop_on_signal(opened.stop):
-        return track(opened, settings, camera_options.TrackLine(opened.feed, line), print_line)
+        return track(opened, settings, show, print_line, _watcher(opened, room))
 
 
 def _wait_text(report: dict[str, Any]) -> list[str]:

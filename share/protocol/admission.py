@@ -10,7 +10,7 @@ from share.mapping.loops import KeyframeKey
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.peer import Peer, RestoredRun
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
-from share.wire.messages import Hello, public_tag
+from share.wire.messages import Hello, PoseUpdate, public_tag
 
 # Limits on new runs, each at once and a second: each run stays in the report, and in the map once it has a
 # keyframe. One name: as many as a person starts while trying things out; one key: a full room; the edge: two.
@@ -145,6 +145,11 @@ class RunRegistry(Mapping[bytes, Peer]):
     def is_latest(self, peer: Peer) -> bool:
         """Return whether no other run of its name joined or came back later."""
         return next(reversed(self._runs_by_name[peer.name])) == peer.key
+
+    def latest_poses(self) -> dict[str, PoseUpdate]:
+        """Return the newest pose of each present run, by run key."""
+        present = (peer for peer in self.values() if not peer.is_gone)
+        return {peer.key: peer.latest_pose for peer in present if peer.latest_pose is not None}
 
     def label(self, peer: Peer) -> str:
         """Return the run's label in reports: its name if it is the latest, else name/tag. No name contains

@@ -173,7 +173,7 @@ class Agent:
         if self._is_connected and self.makes_keyframes and self._pace.take_pose(self._now_ns):
             self._counts["poses"] += 1
             last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
-            self._send(pose_update(frame, T_odom_body, last, first))
+            self._send(pose_update(frame, T_odom_body, last, first, self._now_ns))
 
     def _on_keyframe_made(self, frame: ev.FrameTracked, candidate: KeyframeCandidate | None) -> None:
         """Make a keyframe of the candidate that came with `frame`, if the rate allows (else drop_rate)."""
@@ -388,7 +388,17 @@ class Agent:
         if (report := self._status_reporter.due_report(self._now_ns)) is not None:
             self._effects.append(report)
             if self._is_connected:
-                self._send(report.status)
+                self._send(self._with_link(report.status))
+
+    def _with_link(self, status: m.Status) -> m.Status:
+        """Return the status with the state of the link to the edge."""
+        waiting_ns = self._ledger.unacknowledged_for_ns(self._now_ns)
+        clock_error_ms = self.clock_estimate(self._now_ns).uncertainty_ms
+        return replace(
+            status,
+            unacknowledged_ms=min(waiting_ns / 1e6, m.MAX_POSE_AGE_MS),
+            clock_error_ms=None if clock_error_ms is None else min(clock_error_ms, m.MAX_POSE_AGE_MS),
+        )
 
     def _finish(self) -> None:
         if self._is_connected:

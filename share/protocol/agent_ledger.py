@@ -66,6 +66,11 @@ class KeyframeLedger:
         """Number of keyframes that the edge never acknowledged, dropped ones included."""
         return len(self._pending) + self.counts["drop_oldest"]
 
+    def unacknowledged_for_ns(self, now_ns: int) -> int:
+        """Return the time since the oldest pending keyframe's frame arrived; 0 without one."""
+        oldest = next(iter(self._pending.values()), None)
+        return 0 if oldest is None else max(0, now_ns - oldest.arrived_ns)
+
     @property
     def buffered_at_edge(self) -> int:
         """Number of pending keyframes that have arrived at the edge."""

@@ -55,6 +55,7 @@ class Edge:
     ) -> None:
         self._config, self._session = config, session
         self._registry, self._unjoined = RunRegistry(), Sender()
+        self.latest_poses = self._registry.latest_poses
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self._admission = Admission(config.edge, self.tracks_agents)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
@@ -142,7 +143,7 @@ class Edge:
             return False
         if peer.is_gone and not self._comes_back(peer, message):
             return False
-        peer.last_received_ns, peer.has_sent = self._now_ns, True
+        peer.mark_received(self._now_ns)
         if peer.credential != event.credential:  # it has changed, or was unknown
             peer.credential = event.credential
             self._effects.append(ed.SetCredential(peer.key, event.credential))
@@ -156,8 +157,7 @@ class Edge:
             case Keyframe():
                 self._on_keyframe(peer, message)
             case wire.PoseUpdate():
-                peer.counts["poses"] += 1
-                peer.status.add_pose(message.state, self._now_ns)
+                peer.add_pose(message, self._now_ns)
             case wire.Status():
                 peer.status.update(message, self._now_ns)
             case wire.Evaluation():
@@ -389,7 +389,7 @@ class Edge:
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         """Return the report of a run without what the mapper knows of it."""
         name = peer.name if self._registry.is_latest(peer) else None
-        return peer.report(self._now_ns) | self._rate_scheduler.report(name)
+        return peer.report(self._now_ns, self._rate_scheduler.report(name, peer.hello.kind))
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, whose `agents` are by run key. Runs

@@ -167,14 +167,15 @@ class MapLocalisation:
 
 
 def pose_update(
-    frame: ev.FrameTracked, T_odom_body: F64, last: LedgerEntry | None, first_of_segment: int
+    frame: ev.FrameTracked, T_odom_body: F64, last: LedgerEntry | None, first_of_segment: int, now_ns: int
 ) -> m.PoseUpdate:
     """Return the pose relative to the last acknowledged keyframe `last`, or in odom if that is of an earlier
     segment. first_of_segment: lowest keyframe id of the present one."""
+    age_ms = min(max(0.0, (now_ns - frame.arrived_ns) / 1e6), m.MAX_POSE_AGE_MS)
     if last is None or last.keyframe.id < first_of_segment:
-        return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body)
+        return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body, age_ms)
     T_keyframe_body = inverse(last.keyframe.T_odom_body) @ T_odom_body
-    return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body)
+    return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body, age_ms)
 
 
 class SelfEvaluation:

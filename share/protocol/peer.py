@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,12 +13,13 @@ from share.geometry import se3
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredMap, map_poses
+from share.protocol.agent_health import PoseAges, agent_troubles
 from share.protocol.correction_delay import ComputationDelay
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
 from share.scheduling.room_budget import Grant
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import TrackState
-from share.wire.messages import Hello, Status, peer_id
+from share.wire.messages import Hello, PoseUpdate, Status, peer_id
 
 SILENT_S = 0.7  # agents report twice a second; after this the last report is no longer shown as the state
 SILENT = "SILENT"
@@ -33,18 +34,25 @@ class PeerStatus:
         self._age_ms: float | None = None  # of the newest pose at `_age_at_ns`
         self._age_at_ns = 0
         self._has_left = False
+        self._pose_ages = PoseAges()
+        self._unacknowledged_ms = 0.0
+        self._clock_error_ms: float | None = None
 
     def update(self, status: Status, now_ns: int) -> None:
         self.state, self._reason, self._has_left = status.state, status.reason, False
         self._age_ms, self._age_at_ns = status.pose_age_ms, now_ns
+        self._unacknowledged_ms, self._clock_error_ms = status.unacknowledged_ms, status.clock_error_ms
 
-    def add_pose(self, state: TrackState, now_ns: int) -> None:
-        """Record a pose message. Its pose is about as old as the newest was at the last status."""
+    def add_pose(self, state: TrackState, now_ns: int, age_ms: float | None = None) -> None:
+        """Record a pose message. age_ms: of its pose; None: about that of the newest at the last status."""
         if state is not self.state:
             self._reason = ""
         self.state, self._has_left = state, False
         if state.has_pose:
             self._age_at_ns = now_ns
+            if age_ms is not None:
+                self._age_ms = age_ms
+                self._pose_ages.add(age_ms, now_ns)
 
     def leave(self) -> None:
         """Record a bye: silence is expected from now on."""
@@ -55,7 +63,8 @@ class PeerStatus:
         reported. last_received_ns: time of the last message; None: none in this session."""
         if last_received_ns is None:
             reason = "no message since the map was restored"
-            return {"state": SILENT, "reason": reason, "pose_age_ms": None, "last_received_s": None}
+            unknown = {"state": SILENT, "reason": reason, "pose_age_ms": None, "last_received_s": None}
+            return unknown | self._link_report(now_ns)
         silent_ns = max(0, now_ns - last_received_ns)
         since_ms = max(0, now_ns - self._age_at_ns) / 1e6
         silent = silent_ns > seconds_to_ns(SILENT_S) and not self._has_left
@@ -65,6 +74,14 @@ class PeerStatus:
             "reason": reason if silent else self._reason,
             "pose_age_ms": None if self._age_ms is None else round(self._age_ms + since_ms, 1),
             "last_received_s": round(silent_ns / SECOND_NS, 3),
+            **self._link_report(now_ns),
+        }
+
+    def _link_report(self, now_ns: int) -> dict[str, Any]:
+        return {
+            **self._pose_ages.report(now_ns),
+            "unacknowledged_ms": round(self._unacknowledged_ms, 1),
+            "clock_error_ms": None if self._clock_error_ms is None else round(self._clock_error_ms, 3),
         }
 
 
@@ -128,6 +145,8 @@ class Peer(Sender):
     last_finding: MapEvent | None = None  # newest correction, repeated with a welcome
     is_welcomed: bool = True  # in this session of the edge
     has_sent: bool = True  # a message in this session
+    joined_ns: int | None = None  # first message in this session
+    latest_pose: PoseUpdate | None = None
     pending_saves: int = 0
     grant: Grant | None = None  # the last that was sent
     computation: ComputationDelay = field(default_factory=ComputationDelay)
@@ -148,12 +167,23 @@ class Peer(Sender):
         is_full = self.pending_saves >= _MAX_PENDING_SAVES
         return f"{self.pending_saves} keyframes wait for the disk" if is_full else None
 
-    def report(self, now_ns: int) -> dict[str, Any]:
-        """Return the fields of edge.json that come from the run's messages."""
+    def mark_received(self, now_ns: int) -> None:
+        """Record that it has sent a message."""
+        self.last_received_ns, self.has_sent = now_ns, True
+        if self.joined_ns is None:
+            self.joined_ns = now_ns
+
+    def add_pose(self, pose: PoseUpdate, now_ns: int) -> None:
+        self.counts["poses"] += 1
+        self.status.add_pose(pose.state, now_ns, pose.age_ms)
+        self.latest_pose = pose
+
+    def report(self, now_ns: int, rating: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the fields of edge.json that come from the run's messages. rating: of `RateScheduler`."""
         status = self.status.report(now_ns, self.last_received_ns if self.has_sent else None)
         if self.overload.is_recent(now_ns, _OVERLOAD_SHOWN_S):
             status["reason"] = "; ".join(filter(None, (status["reason"], self.overload.reason)))
-        return {
+        report = {
             "kind": str(self.hello.kind),
             "run": self.key,
             **status,
@@ -163,7 +193,11 @@ class Peer(Sender):
             "last_refusal": self.refusals.reason or None,
             "suspect_keyframes": self.suspect_keyframes.count,
             "last_suspicion": self.suspect_keyframes.reason or None,
+            **rating,
         }
+        joined_s = 0.0 if self.joined_ns is None else (now_ns - self.joined_ns) * 1e-9
+        troubles = [] if self.is_gone else agent_troubles(self.hello.kind, report, joined_s)
+        return report | {"trouble": troubles}
 
 
 def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list[str]:

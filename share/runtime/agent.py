@@ -5,10 +5,10 @@
 
 A live camera has no reader thread: the tracker takes the newest frame (`share.runtime.arrivals`).
 
-A recording is played at its recorded pace and no frame is dropped: the reader waits when the tracker is
-behind (policy `block`), while a frame still counts as arrived when it was due. So the poses of a
-recording are the same to the last digit on any machine, with or without an edge, and lateness shows
-in the latency. With `agent.late_ms` late frames are dropped instead (policy `drop_late`).
+A recording is played at its recorded pace: the reader waits when the tracker is behind (policy `block`),
+while a frame still counts as arrived when it was due. So the poses of a robot's recording are the same to the
+last digit on any machine, with or without an edge, and lateness shows in the latency. A headset's are where
+the machine keeps up: what is later than `agent.late_ms` gets a predicted pose instead (policy `drop_late`).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from share.net.transport import AgentLink
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.agent_health import LIMITS
 from share.protocol.streaming import StreamingAgent
 from share.runtime.arrivals import (
     FrameArrivals,
@@ -39,6 +40,7 @@ from share.runtime.arrivals import (
     LatenessMonitor,
     LiveArrivals,
     RecordedArrivals,
+    late_limit_ms,
 )
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate
 from share.runtime.frame_consumers import FrameConsumer, LocalTracking, RemoteTracking
@@ -118,8 +120,9 @@ class AgentRun:
             else LocalTracking(source, settings, self._guard, estimator, self._log, notify)
         )
         self._pose_sinks = pose_sinks
-        self._late_dropper = LateFrameDropper(settings.agent.late_ms)
-        self._lateness_monitor = LatenessMonitor(notify, self._consumer.bottleneck)
+        self._late_dropper = LateFrameDropper(late_limit_ms(settings.agent.late_ms, hello))
+        tolerated_ms = LIMITS[hello.kind].pose_ms
+        self._lateness_monitor = LatenessMonitor(notify, self._consumer.bottleneck, tolerated_ms)
         self._counters = SequencerCounters()
         self._link = connect()  # last: any error above is raised before the edge sees this agent
         self._arrivals = self._make_arrivals()
@@ -186,8 +189,9 @@ class AgentRun:
     def _track(self) -> None:
         try:
             self._consumer.start()
-            for frame, arrived_ns in self._arrivals.iter_frames():
-                self._consumer.consume(frame, arrived_ns, self._post)
+            for frame, arrived_ns, is_late in self._arrivals.iter_frames():
+                handle = self._consumer.predict if is_late else self._consumer.consume
+                handle(frame, arrived_ns, self._post)
         except BaseException as error:
             self._shared.error = error
         finally:

@@ -6,30 +6,41 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from share.cameras.feed import CameraFeed
 from share.protocol.agent_events import AgentTick
 from share.protocol.agent_status import LATE_S
-from share.types import Frame, ImuBatch
+from share.types import AgentKind, Frame, ImuBatch
+from share.wire.messages import Hello
 
 READ_AHEAD = 30  # frames decoded before they are due
 _WAIT_S = 0.1
 _DROP_WARNING_S = 2.0  # how long a warning about dropped images is shown
 _TOO_SLOW = "too slow for the camera: images are dropped"
 _FIRST_WARNING_S = 1.0  # lateness of poses at the first warning; the next comes at twice the last one
-_LATE_FRAMES_ADVICE = "set agent.late_ms to drop late frames, or use smaller images or a faster machine"
+_SLOW_ADVICE = "use smaller images or a faster machine"
 
 FrameStream = Callable[[], Iterator[Frame]]  # starts decoding
+
+
+class Arrival(NamedTuple):
+    """A frame, with all IMU samples since the last one that was to be tracked. arrived_ns: monotonic.
+    is_late: it came too late to be tracked."""
+
+    frame: Frame
+    arrived_ns: int
+    is_late: bool = False
 
 
 class FrameArrivals(Protocol):
     """A source of frames with arrival times."""
 
-    def iter_frames(self) -> Iterator[tuple[Frame, int]]:
-        """Yield each frame and its arrival on the monotonic clock, ns, until the end or `stop`."""
+    def iter_frames(self) -> Iterator[Arrival]:
+        """Yield each frame until the end or `stop`."""
         ...
 
     def stop(self) -> None: ...
@@ -59,7 +70,7 @@ class RecordedArrivals:
     def stop(self) -> None:
         self._stop.set()
 
-    def iter_frames(self) -> Iterator[tuple[Frame, int]]:
+    def iter_frames(self) -> Iterator[Arrival]:
         reader = threading.Thread(target=self._read_frames, name="reader", daemon=True)
         reader.start()
         try:
@@ -70,7 +81,7 @@ class RecordedArrivals:
         if self._error is not None:
             raise self._error
 
-    def _frames_when_due(self) -> Iterator[tuple[Frame, int]]:
+    def _frames_when_due(self) -> Iterator[Arrival]:
         first: tuple[int, int] | None = None
         while not self._stop.is_set():
             try:
@@ -85,10 +96,10 @@ class RecordedArrivals:
             if due_ns > now_ns and self._stop.wait((due_ns - now_ns) * 1e-9):
                 return
             late_ns, has_next = time.monotonic_ns() - due_ns, not self._queue.empty()
-            if (admitted := self._late_dropper.admit(frame, late_ns, has_next)) is not None:
-                self._is_tracking = True
-                yield admitted, due_ns
-                self._is_tracking = False
+            with_imu, is_late = self._late_dropper.judge(frame, late_ns, has_next)
+            self._is_tracking = True
+            yield Arrival(with_imu, due_ns, is_late)
+            self._is_tracking = False
 
     def _read_frames(self) -> None:
         try:
@@ -130,44 +141,65 @@ class LiveArrivals:
     def stop(self) -> None:
         self._camera.stop()
 
-    def iter_frames(self) -> Iterator[tuple[Frame, int]]:
+    def iter_frames(self) -> Iterator[Arrival]:
         for frame in self._frames():
             if self._dropped is None:
                 self._dropped = self._camera.images_dropped
-            yield frame, self._camera.arrived_ns(frame.stamp_ns)
+            yield Arrival(frame, self._camera.arrived_ns(frame.stamp_ns))
 
 
 class LateFrameDropper:
-    """Drops frames that come too late to be tracked (policy `drop_late`), and keeps their IMU samples."""
+    """Judges which frames come too late to be tracked (policy `drop_late`), and keeps their IMU samples."""
 
     def __init__(self, late_ms: float) -> None:
-        """late_ms: delay from which a frame is dropped; 0 drops none."""
+        """late_ms: delay from which a frame is not tracked; 0: all are."""
         self._late_ns = late_ms * 1e6
-        self._skipped_imu: list[ImuBatch] = []
+        self._skipped_imu = ImuBatch.empty()
         self.dropped = 0  # frames
 
-    def admit(self, frame: Frame, late_ns: int, has_next: bool) -> Frame | None:
-        """Return `frame` with all IMU samples since the last admitted one, or None to drop it.
+    def judge(self, frame: Frame, late_ns: int, has_next: bool) -> tuple[Frame, bool]:
+        """Return `frame` with all IMU samples since the last one that was not late, and whether it is late.
 
-        late_ns: time since it arrived. A frame is dropped only if a later one waits (`has_next`).
+        late_ns: time since it arrived. A frame is late only if a later one waits (`has_next`).
         """
-        if has_next and 0 < self._late_ns < late_ns:
-            self.dropped += 1
-            self._skipped_imu.append(frame.imu)
-            return None
-        skipped, self._skipped_imu = self._skipped_imu, []
-        return replace(frame, imu=skipped[0].concatenate(*skipped[1:], frame.imu)) if skipped else frame
+        if len(self._skipped_imu):
+            frame = replace(frame, imu=self._skipped_imu.concatenate(frame.imu))
+        is_late = has_next and 0 < self._late_ns < late_ns
+        self._skipped_imu = frame.imu if is_late else ImuBatch.empty()
+        self.dropped += is_late
+        return frame, is_late
+
+
+_HEADSET_LATE_MS = 100.0  # a headset whose pose is older is better served by a prediction
+
+
+def late_limit_ms(late_ms: float | None, hello: Hello) -> float:
+    """Return the delay from which a frame is not tracked; 0: all are. late_ms: as in the configuration.
+
+    By default a headset stays fresh where its IMU can predict its pose; a robot rather waits."""
+    if late_ms is not None:
+        return late_ms
+    can_predict = hello.rig.imu is not None and not hello.streams_frames
+    return _HEADSET_LATE_MS if hello.kind is AgentKind.AR and can_predict else 0.0
+
+
+_WINDOW = 100  # frames
+_FRAMES_BETWEEN_WARNINGS = 900  # a minute at 15 Hz
 
 
 class LatenessMonitor:
     """Counts frames with a pose more than LATE_S after the image; warns when lateness first exceeds 1 s, and
-    each time it doubles."""
+    each time it doubles. Says that the agent cannot keep up when most of its newest poses come later than its
+    kind tolerates, at most once a minute."""
 
-    def __init__(self, notify: Callable[[str], None], bottleneck: str) -> None:
-        """bottleneck: the cause to name, such as "this machine"."""
-        self._notify, self._bottleneck = notify, bottleneck
+    def __init__(self, notify: Callable[[str], None], bottleneck: str, limit_ms: float) -> None:
+        """bottleneck: the cause to name, such as "this machine". limit_ms: what its kind tolerates."""
+        self._notify, self._bottleneck, self._limit_ms = notify, bottleneck, limit_ms
         self._next_warning_s = _FIRST_WARNING_S
         self._late_frames, self._max_late_s = 0, 0.0
+        self._is_over: deque[bool] = deque(maxlen=_WINDOW)
+        self._behind_frames = 0
+        self._quiet_frames = 0  # until a warning may come again
 
     def record(self, track_ms: float) -> None:
         """Record that a frame's pose came `track_ms` after its image."""
@@ -177,9 +209,28 @@ class LatenessMonitor:
         if late_s >= self._next_warning_s:
             self._next_warning_s = 2 * late_s
             self._notify(
-                f"poses are {late_s:.1f} s late: {self._bottleneck} "
-                f"is too slow for this source; {_LATE_FRAMES_ADVICE}"
+                f"poses are {late_s:.1f} s late: {self._bottleneck} is too slow for this source; "
+                f"{_SLOW_ADVICE}"
+            )
+        self._check_pace(track_ms)
+
+    def _check_pace(self, track_ms: float) -> None:
+        self._quiet_frames = max(0, self._quiet_frames - 1)
+        self._is_over.append(track_ms > self._limit_ms)
+        over = sum(self._is_over)
+        if len(self._is_over) < _WINDOW or 2 * over <= _WINDOW:
+            return
+        self._behind_frames += 1
+        if not self._quiet_frames:
+            self._quiet_frames = _FRAMES_BETWEEN_WARNINGS
+            self._notify(
+                f"cannot keep up: {over} of the last {_WINDOW} poses came more than {self._limit_ms:.0f} ms "
+                f"after their images; {_SLOW_ADVICE}"
             )
 
     def report(self) -> dict[str, Any]:
-        return {"late_frames": self._late_frames, "max_late_s": round(self._max_late_s, 3)}
+        return {
+            "late_frames": self._late_frames,
+            "max_late_s": round(self._max_late_s, 3),
+            "behind_frames": self._behind_frames,
+        }

@@ -13,7 +13,7 @@ import queue
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from share.config import Config
 from share.errors import StoreError
 from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
+from share.protocol.agent_health import trouble_lines
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
     AddKeyframe,
@@ -49,6 +50,7 @@ from share.protocol.edge_events import (
 from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
+from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.map_writer import MapWriter
@@ -63,6 +65,7 @@ from share.store.map_store import MapStore
 
 TICK_MS = 50
 _REPORT_S = 0.1  # period of reports
+_POSES_SHOWN_S, _REPORT_SHOWN_S = 0.05, 0.5  # periods of what an observer is shown
 _TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
 MAX_REFUSAL_KINDS = 64  # kinds of refused handshakes that are logged; more are only counted
 _MAX_MESSAGES_PER_STEP = 64  # received before answers, ticks and reports get their turn
@@ -111,8 +114,11 @@ class EdgeRun:
         out: Path | None,
         on_record: Callable[[dict[str, Any]], None],
         store: MapStore | None = None,
+        observers: Sequence[EdgeObserver] = (),
     ) -> None:
         self._settings, self._link, self._on_record = settings, link, on_record
+        self._observer = EdgeObservers(*observers)
+        self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
         has_keys = link.agent_names("") is not None
         notify_map = partial(self._log_event, "map")
         self._restarts = MapperRestarts(store, settings.merge.enter_m, notify_map, has_keys)
@@ -200,6 +206,7 @@ class EdgeRun:
             "refused": [*self._other_troubles.current(), *report["refused"]],
             "refused_handshakes": self._refused_handshakes.total(),
             "trouble": [*self._troubles.current(), *filter(None, current)],
+            "agent_trouble": trouble_lines(report["agents"]),
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
             **self._progress.last_solve(),
         }
@@ -231,6 +238,8 @@ class EdgeRun:
             )
         else:
             self._start_mapping(*loaded, start_delay_s)
+        store = self._restarts.store
+        self._observer.begin_session(None if store is None else store.path, loaded[1])
 
     def _start_mapping(
         self, restore: RestoreMap | None, known: list[RestoredRun], start_delay_s: float
@@ -264,12 +273,23 @@ class EdgeRun:
             self._restart_mapping(self._restart_reason)
         if time.monotonic() >= self._report_due_s:
             self._try_to_report()
+        self._show_state(time.monotonic())
+
+    def _show_state(self, now_s: float) -> None:
+        """Show poses and report to the observer, where due."""
+        if now_s - self._poses_shown_s >= _POSES_SHOWN_S:
+            self._poses_shown_s = now_s
+            self._observer.add_poses(self._state_machine.latest_poses())
+        if now_s - self._report_shown_s >= _REPORT_SHOWN_S:
+            self._report_shown_s = now_s
+            self._observer.add_report(self._report)
 
     def _handle_answers(self) -> None:
         while not self._inbox.empty():
             match self._inbox.get():
                 case MapperResult() as findings:
                     self._handle(findings)
+                    self._observer.add_result(findings)
                 case ChangesSaved() | TrackerReady() | TrackerAnswered() as answer:
                     self._handle(answer)
                 case TrackerLost() as tracker if not self._stopping:
@@ -323,6 +343,7 @@ class EdgeRun:
             self._execute(effect)
 
     def _execute(self, effect: EdgeEffect) -> None:
+        self._observer.add_effect(effect)
         match effect:
             case SendToPeer():
                 self._link.send(effect.peer_id, effect.frames)

@@ -18,7 +18,7 @@ from share.runtime.error_estimators import ErrorEstimator
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.runtime.imu_bias_store import ImuBiasStore
 from share.runtime.source import Source
-from share.types import Frame
+from share.types import Frame, TrackState
 
 _POLL_S = 0.05
 TRACKER_START_S = 20.0  # longest wait of a recording for the edge's tracker before it plays
@@ -37,6 +37,9 @@ class FrameConsumer:
     def consume(self, frame: Frame, arrived_ns: int, post: Post) -> None:
         """Handle a frame; `post` events to the state machine."""
         raise NotImplementedError
+
+    def predict(self, frame: Frame, arrived_ns: int, post: Post) -> None:
+        """Handle a frame that comes too late to be tracked: it is left out."""
 
     def event_handled(self, event: ev.AgentEvent, is_connected: bool) -> None:
         """The state machine has handled `event`."""
@@ -69,10 +72,12 @@ class LocalTracking(FrameConsumer):
         self._guard, self._error_estimator, self._log = guard, error_estimator, log
         self._bias_store = ImuBiasStore(source, settings.inertial, notify)
         self._tracker = GuardedTracker(source.rig, settings, guard, self._bias_store.bias)
+        self._state = TrackState.INITIALISING  # of the last tracked frame
 
     def consume(self, frame: Frame, arrived_ns: int, post: Post) -> None:
         cpu_start_s = time.thread_time()
         result = self._tracker.track(frame)
+        self._state = result.state
         tracked = ev.FrameTracked(
             index=frame.index,
             stamp_ns=frame.stamp_ns,
@@ -97,6 +102,16 @@ class LocalTracking(FrameConsumer):
         self._tracker.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
         self._log.imu_outliers = self._tracker.rejected_imu_samples
         self._log.cpu_s += time.thread_time() - cpu_start_s
+
+    def predict(self, frame: Frame, arrived_ns: int, post: Post) -> None:
+        """Post the pose that the IMU predicts, as late as it is: leaving a frame out never looks good."""
+        T_odom_body = self._tracker.predict(frame)
+        if T_odom_body is None:  # no pose yet, or none any more
+            state = self._state if not self._state.has_pose else TrackState.LOST
+        else:
+            state = self._state if self._state.has_pose else TrackState.INERTIAL_ONLY
+        times = frame.index, frame.stamp_ns, arrived_ns, time.monotonic_ns()
+        post(ev.FrameTracked(*times, state, T_odom_body))
 
     def _estimate_error_cm(self, frame: Frame, result: TrackResult) -> float | None:
         error_cm: float | None = None

@@ -13,10 +13,11 @@ from typing import TypeVar
 from share.config import Config
 from share.errors import ShareError
 from share.geometry.camera import ImuBias, Rig
+from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.runtime.pipeline import make_tracker
 from share.timing import LineLimiter
-from share.types import FeatureStatistics, Frame, KeyframeCandidate, TrackState
+from share.types import F64, FeatureStatistics, Frame, KeyframeCandidate, TrackState
 
 _MAX_TEXT = 160  # characters of an error
 
@@ -68,6 +69,7 @@ class GuardedTracker:
         """bias: initial bias of the IMU, None if unknown."""
         self._make_tracker = partial(make_tracker, rig, config, bias)
         self._tracker, self._guard = self._make_tracker(), guard
+        self._timeshift_ns = rig.timeshift_ns
         self.bias: ImuBias | None = None  # newest estimate at a keyframe
         self._had_pose = False  # since the last failure
         self._rejected_before = 0  # IMU samples, by earlier trackers
@@ -78,6 +80,15 @@ class GuardedTracker:
             return TrackResult(TrackState.LOST, None)
         self._had_pose = self._had_pose or result.T_odom_body is not None
         return result
+
+    def predict(self, frame: Frame) -> F64 | None:
+        """Return T_odom_body (4, 4) at a frame that is not tracked, by the IMU samples since the last one
+        that was; None without a pose, or a tracker that knows the IMU."""
+        T_odom_body = None
+        if isinstance(self._tracker, InertialTracker) and len(frame.imu):
+            with self._guard.step("predicting a pose"):
+                T_odom_body = self._tracker.predict(frame.stamp_ns + self._timeshift_ns, frame.imu)
+        return T_odom_body
 
     def attempt(self, what: str, frame: Frame, step: Callable[[], T]) -> T | None:
         """Return `step()`, a step of the newest `frame`; None if it fails. Raises ShareError only."""

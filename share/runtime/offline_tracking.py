@@ -68,9 +68,10 @@ def track(
     settings: config.Config,
     on_result: Callable[[TrackResult], None],
     notify: Callable[[str], None] = lambda text: None,
+    on_frame: Callable[[OfflineFrame], None] = lambda step: None,
 ) -> TrackingOutput:
-    """Track all frames of a recording, or the newest ones of a live camera. Call `on_result` for each frame
-    and `notify` for messages to the user. Raises UsageError where no tracker fits the rig."""
+    """Track all frames of a recording, or the newest ones of a live camera. Call `on_result` and `on_frame`
+    for each frame and `notify` for messages to the user. Raises UsageError where no tracker fits the rig."""
     check_trackable(source.name, source.rig)
     guard, bias_store = FaultGuard(notify), ImuBiasStore(source, settings.inertial, notify)
     tracker = GuardedTracker(source.rig, settings, guard, bias_store.bias)
@@ -88,6 +89,7 @@ def track(
             stamps.append(stamp_ns)
             poses.append(result.T_odom_body)
         on_result(result)
+        on_frame(step)
     bias_store.save(tracker.bias)
     log.imu_outliers = tracker.rejected_imu_samples
     trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))

@@ -1,4 +1,6 @@
-"""The status page: it fetches /snapshot.json three times a second and shows it. Self-contained."""
+"""The status page: it fetches /snapshot.json three times a second, /plan.json once, and shows them.
+
+Self-contained, for machines without a 3D view and for phones."""
 
 from __future__ import annotations
 
@@ -15,6 +17,8 @@ header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem 
 h1 { font-size: 1.25rem; margin: 0 }
 h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
 header span, td.none { color: var(--dim) }
+a { color: inherit }
+td i { display: inline-block; width: .7em; height: .7em; margin-right: .4em; flex: none }
 #mark { font-weight: 600; color: var(--good) }
 .bad, #mark.bad { color: var(--bad) }
 #trouble { margin: .5rem 0 0; padding-left: 1.2rem; color: var(--bad); overflow-wrap: anywhere }
@@ -32,21 +36,39 @@ td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
 tr.gone { color: var(--dim) }
 #agents td:nth-child(4) { white-space: normal; min-width: 9rem; max-width: 18rem; overflow-wrap: anywhere }
 .stale { opacity: .45 }
-@media (max-width: 40rem) {
-  body { font-size: 13px; padding: .7rem }
-  th, td { padding-right: .5rem }
-  td:first-child { max-width: 6.5rem }
+#plan { display: flex; flex-wrap: wrap; gap: 1rem }
+#plan figure { margin: 0; flex: 1 1 20rem; min-width: 0; max-width: 36rem }
+#plan figcaption { color: var(--dim) }
+#plan svg { width: 100%; height: auto; max-height: 22rem; border: 1px solid var(--line); border-radius: 4px }
+#plan text { fill: currentColor }
+@media (max-width: 48rem) {
+  body { font-size: 14px; padding: .7rem }
+  table, tbody { display: block }
+  tr:has(th) { display: none }
+  tr { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: 0 .8rem;
+       border-bottom: 1px solid var(--line); padding: .4rem 0 }
+  td, td:first-child, #agents td:nth-child(4), #consistency td:nth-child(3) {
+    display: flex; justify-content: space-between; gap: .6rem; border: 0; padding: .1rem 0; max-width: none;
+    min-width: 0; text-align: right; white-space: normal; overflow-wrap: anywhere }
+  td::before { content: attr(data-label); color: var(--dim); flex: none; text-align: left }
+  td:first-child { grid-column: 1 / -1; font-weight: 600; justify-content: flex-start }
+  td:first-child::before { display: none }
+  td[data-label=reason] { grid-column: 1 / -1 }
+  td.empty { display: none }
 }
 </style>
-<header><h1>SHARE edge</h1><b id="mark">…</b><span id="about"></span></header>
+<header><h1>SHARE edge</h1><b id="mark">…</b><a id="room" hidden>live room</a><span id="about"></span>
+</header>
 <ul id="trouble"></ul>
 <main>
 <h2>Agents</h2><div class="wide"><table id="agents" class="words"></table></div>
+<h2>Plan</h2><div id="plan"></div>
 <h2>Agent consistency</h2><div class="wide"><table id="consistency"></table></div>
 <h2>Maps</h2><div class="wide"><table id="maps"></table></div>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
 </main>
+<svg id="svg" hidden></svg>
 <script>
 "use strict";
 const at = id => document.getElementById(id);
@@ -64,7 +86,12 @@ function node(tag, content, kind) {
 function table(id, head, rows) {
   const body = rows.map(({cells, kind}) => {
     const row = node("tr", "", kind);
-    row.append(...cells.map(c => c instanceof Node ? c : node("td", text(c))));
+    row.append(...cells.map((c, k) => {
+      const cell = c instanceof Node ? c : node("td", text(c));
+      cell.dataset.label = head[k];
+      if (cell.textContent === "–") cell.classList.add("empty");
+      return cell;
+    }));
     return row;
   });
   if (!body.length) body.push(node("td", "none yet", "none"));
@@ -79,9 +106,63 @@ function duration(s) {
   return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
 }
 
+const COLOURS = ["#3a97d4", "#e69f00", "#009e73", "#c7b500", "#d55e00", "#cc79a7", "#0072b2", "#999"];
+let colours = {};
+const colour = name => colours[name] ??= COLOURS[Object.keys(colours).length % COLOURS.length];
+
+const SVG = at("svg").namespaceURI;
+function shape(tag, attributes, content) {
+  const element = document.createElementNS(SVG, tag);
+  for (const [name, value] of entries(attributes)) element.setAttribute(name, value);
+  if (content) element.textContent = content;
+  return element;
+}
+
+function planOfMap(id, agents) {
+  const paths = entries(agents).flatMap(([name, a]) =>
+    a.parts.filter(p => p.map_id === id && p.path.length).map(p => ({name, path: p.path})));
+  const here = entries(agents).filter(([, a]) => a.map_id === id && a.position);
+  const all = [...paths.flatMap(p => p.path), ...here.map(([, a]) => a.position)];
+  if (!all.length) return null;
+  const bound = (k, of) => all.reduce((best, p) => of(best, p[k]), all[0][k]);
+  const [x0, x1] = [bound(0, Math.min) - 1, bound(0, Math.max) + 1];
+  const [y0, y1] = [bound(1, Math.min) - 1, bound(1, Math.max) + 1];
+  const [width, height] = [Math.max(x1 - x0, 3), Math.max(y1 - y0, 3)];
+  const unit = Math.max(width, height) / 40;  // m, of a mark
+  const [X, Y] = [x => x - x0, y => y1 - y];
+  const svg = shape("svg", {viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `map ${id}`});
+  const rule = (x1, y1, x2, y2) =>
+    svg.append(shape("line", {x1, y1, x2, y2, stroke: "#8883", "stroke-width": unit / 15}));
+  for (let x = Math.ceil(x0); x < x0 + width; x++) rule(X(x), 0, X(x), height);
+  for (let y = Math.ceil(y1 - height); y < y1; y++) rule(0, Y(y), width, Y(y));
+  for (const {name, path} of paths)
+    svg.append(shape("polyline", {points: path.map(p => `${X(p[0])},${Y(p[1])}`).join(" "), fill: "none",
+      stroke: colour(name), "stroke-width": unit / 4, "stroke-linejoin": "round"}));
+  for (const [name, a] of here) {
+    const [x, y] = [X(a.position[0]), Y(a.position[1])];
+    const turn = `translate(${x} ${y}) rotate(${-a.heading * 180 / Math.PI}) scale(${unit})`;
+    const outline = {fill: "none", stroke: colour(name), "stroke-width": .3};
+    svg.append(shape("path", {transform: turn, ...a.kind === "robot"
+      ? {d: "M1 0A1 1 0 1 1 1 -.01M0 0H1", ...outline}
+      : {d: "M0 0L1.6 -.9V.9Z", fill: colour(name)}}));
+    svg.append(shape("text", {x: x + unit, y: y - unit, "font-size": 1.8 * unit}, name));
+  }
+  const figure = document.createElement("figure");
+  const who = here.map(([name]) => name).join(", ") || "nobody now";
+  figure.append(svg, node("figcaption", `map ${id}, 1 m a square: ${who}`));
+  return figure;
+}
+
+function showPlan(plan) {
+  const ids = [...new Set(entries(plan.agents).flatMap(([, a]) => a.parts.map(p => p.map_id)))];
+  const figures = ids.map(id => planOfMap(id, plan.agents)).filter(Boolean);
+  at("plan").replaceChildren(...(figures.length ? figures : [node("span", "no path yet", "none")]));
+}
+
 const isLost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
 const isStale = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
-const age = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
+const age = ms => typeof ms !== "number" ? "–"
+  : ms < 1000 ? `${fixed(ms, 0)} ms` : `${fixed(ms / 1000, 1)} s`;
 
 const isQuarantined = a => ["set apart", "disputed"].includes(a.consistency?.state);
 const percent = log => Math.abs(100 * Math.expm1(log)).toFixed(1);
@@ -113,9 +194,16 @@ function mark(content, bad) {
   at("mark").className = bad ? "bad" : "";
 }
 
+function named(name) {
+  const cell = node("td", name), swatch = document.createElement("i");
+  swatch.style.background = colour(name);
+  cell.prepend(swatch);
+  return cell;
+}
+
 function show(now) {
   updateRates(now);
-  const trouble = now.trouble ?? [];
+  const trouble = [...now.trouble ?? [], ...now.agent_trouble ?? []];
   const count = matches => entries(now.agents).filter(([, a]) => matches(a)).length;
   const agentCount = n => `${n} agent${n === 1 ? "" : "s"}`;
   const stale = count(a => isLost(a) || isStale(a));
@@ -129,15 +217,22 @@ function show(now) {
   if (now.waiting !== undefined) about.push(`waiting ${text(now.waiting)}`);
   if (typeof now.last_solve_s === "number") about.push(`solved ${duration(now.last_solve_s)} ago`);
   if (now.failed_steps) about.push(`failed steps ${now.failed_steps}`);
+  at("room").hidden = !now.live_room;
+  const port = now.live_room?.split(":").pop();
+  if (port) at("room").href = `${location.protocol}//${location.hostname}:${port}/`;
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
   table("agents",
-    ["name", "state", "pose age", "reason", "kind", "keyframes", "corrections", "map", "kB/s", "loops"],
+    ["name", "state", "pose age", "reason", "kind", "poses come after", "QoE (target)", "delay",
+     "keyframes", "rate", "corrections", "map", "kB/s", "loops"],
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      name, node("td", a.gone ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
+      named(name), node("td", a.gone ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
       node("td", a.gone ? "–" : age(a.pose_age_ms), isStale(a) ? "bad" : ""),
-      a.reason, a.kind, a.keyframes, a.corrections, a.map_id, a.gone ? "–" : fixed(rates[name], 1),
-      `${text(a.loops?.accepted)} of ${text(a.loops?.tried)}`]})));
+      a.reason, a.kind, a.gone ? "–" : age(a.pose_ms),
+      Number.isFinite(a.qoe) ? `${fixed(a.qoe, 2)} (${fixed(a.qoe_target, 2)})` : "–", age(a.delay_ms),
+      a.keyframes,
+      Number.isFinite(a.rate_hz) ? `${fixed(a.rate_hz, 1)} Hz` : "–", a.corrections, a.map_id,
+      a.gone ? "–" : fixed(rates[name], 1), `${text(a.loops?.accepted)} of ${text(a.loops?.tried)}`]})));
   table("consistency", ["name", "state", "reason"],
     agents.filter(([, a]) => a.consistency).map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
       name, node("td", a.consistency.state, isQuarantined(a) && !a.gone ? "bad" : ""),
@@ -165,7 +260,15 @@ async function refresh() {
   }
   setTimeout(refresh, 300);
 }
+async function refreshPlan() {
+  try {
+    const answer = await fetch("plan.json", {signal: AbortSignal.timeout(4000)});
+    if (answer.ok) showPlan(await answer.json());
+  } catch {}  // the mark says that there is no answer
+  setTimeout(refreshPlan, 1000);
+}
 refresh();
+refreshPlan();
 </script>
 </html>
 """

@@ -1,22 +1,17 @@
-"""The edge's status over HTTP: health, metrics in Prometheus' text format by a table, report and a status
-page (docs/lookup/status.md)."""
+"""The edge's status over HTTP: health, metrics, report, plan and a status page (docs/lookup/status.md)."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from share.runtime.edge_metrics import render_metrics
 from share.runtime.status_page import PAGE
 from share.runtime.web import Response, WebServer, text_response
-
-if TYPE_CHECKING:
-    from prometheus_client.core import Metric
-
 
 CACHE_S = 0.1  # lifetime of a response: any number of clients costs the edge ten reports a second
 
@@ -26,7 +21,8 @@ class StatusServer:
 
     report: returns the edge's report as in edge.json, with current problems as `trouble`, `last_solve_s` and
     `uptime_s` where known. Called from the server's thread; if it fails, the response says so, and `notify`
-    is called once. Raises UsageError or TransportError like `WebServer`.
+    is called once. token: as in `WebServer`. plan: returns /plan.json, as `Plan.report`. Raises UsageError or
+    TransportError like it.
     """
 
     def __init__(
@@ -34,12 +30,14 @@ class StatusServer:
         address: str,
         report: Callable[[], dict[str, Any]],
         notify: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+        token: str | None = None,
+        plan: Callable[[], dict[str, Any]] = lambda: {"agents": {}},
     ) -> None:
-        self._get_report, self._notify = report, notify
+        self._get_report, self._get_plan, self._notify = report, plan, notify
         self._start_s = time.monotonic()
         self._cache: dict[str, tuple[float, Response]] = {}
         self._failed = False
-        self._server = WebServer(address, self._respond)
+        self._server = WebServer(address, self._respond, token)
 
     @property
     def endpoint(self) -> str:
@@ -53,8 +51,9 @@ class StatusServer:
     def _respond(self, path: str) -> Response:
         if path == "/":
             return _PAGE
-        if path not in _REPORTS:
-            return text_response(HTTPStatus.NOT_FOUND, f"not found; available: / {' '.join(_REPORTS)}")
+        if path not in (*_REPORTS, _PLAN):
+            available = " ".join(("/", *_REPORTS, _PLAN))
+            return text_response(HTTPStatus.NOT_FOUND, f"not found; available: {available}")
         cached_s, response = self._cache.get(path, (-CACHE_S, None))
         if response is None or time.monotonic() - cached_s > CACHE_S:
             response = self._render(path)
@@ -63,6 +62,8 @@ class StatusServer:
 
     def _render(self, path: str) -> Response:
         try:
+            if path == _PLAN:
+                return _json(HTTPStatus.OK, self._get_plan())
             return _REPORTS[path](
                 {"uptime_s": round(time.monotonic() - self._start_s, 3), **self._get_report()}
             )
@@ -75,17 +76,31 @@ class StatusServer:
 
 
 def _health(report: dict[str, Any]) -> Response:
-    """Return health as JSON; with status 503 if there is trouble, for monitors that read only the status."""
-    trouble = list(report.get("trouble") or ())
+    """Return health as JSON; with status 503 if the edge is in trouble, for monitors that read only the
+    status. An agent's trouble does not count there: else a peer could have the edge restarted."""
+    return _json(_status_of(report.get("trouble")), _health_report(report))
+
+
+def _agents_health(report: dict[str, Any]) -> Response:
+    """Return the same, with status 503 if the edge or an agent is in trouble."""
+    return _json(_status_of(report.get("trouble") or report.get("agent_trouble")), _health_report(report))
+
+
+def _status_of(trouble: Any) -> HTTPStatus:
+    return HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK
+
+
+def _health_report(report: dict[str, Any]) -> dict[str, Any]:
+    trouble, agent_trouble = (list(report.get(key) or ()) for key in ("trouble", "agent_trouble"))
     agents = report.get("agents", {}).items()
-    health: dict[str, Any] = {
-        "status": "trouble" if trouble else "ok",
+    return {
+        "status": "trouble" if trouble or agent_trouble else "ok",
         "trouble": trouble,
+        "agent_trouble": agent_trouble,
         "refused": list(report.get("refused") or ()),
         "agents": sorted(name for name, agent in agents if not agent.get("gone")),
         **{key: report[key] for key in ("uptime_s", "waiting", "last_solve_s") if key in report},
     }
-    return _json(HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, health)
 
 
 def _metrics(report: dict[str, Any]) -> Response:
@@ -103,163 +118,10 @@ def _json(status: HTTPStatus, value: Any) -> Response:
 
 
 _PAGE = Response(HTTPStatus.OK, "text/html; charset=utf-8", PAGE.encode())
-_REPORTS = {"/health": _health, "/metrics": _metrics, "/snapshot.json": _snapshot}
-
-
-@dataclass(frozen=True)
-class MetricSpec:
-    """One metric. path: dotted keys to its number in the report, or in each entry of the report's mapping
-    `over`. labels: first the entry's key, then dotted keys in the entry.
-
-    Names and units follow Prometheus, *Metric and label naming*; counters (..._total) only grow.
-    """
-
-    name: str
-    help: str
-    path: str
-    over: str = ""
-    labels: tuple[str, ...] = ()
-    scale: float = 1.0  # from the report's unit to that in the name
-
-
-_PER_AGENT = ("agents", ("agent", "kind"))
-METRICS = (
-    MetricSpec("share_edge_uptime_seconds", "Time since the edge started.", "uptime_s"),
-    MetricSpec("share_edge_waiting_keyframes", "Keyframes waiting for place recognition.", "waiting"),
-    MetricSpec("share_edge_last_solve_age_seconds", "Time since the last pose graph solve.", "last_solve_s"),
-    MetricSpec("share_edge_troubles", "Number of current problems; /health lists them.", "trouble"),
-    MetricSpec("share_edge_failed_steps_total", "Steps of the mapper that raised an error.", "failed_steps"),
-    MetricSpec("share_edge_refused_handshakes_total", "Refused attempts to connect.", "refused_handshakes"),
-    MetricSpec("share_edge_maps", "Separate maps.", "maps"),
-    MetricSpec("share_edge_map_keyframes", "Keyframes in a map.", "", "maps", ("map",)),
-    MetricSpec("share_edge_loops", "Loops in the maps.", "loops.in_map"),
-    MetricSpec("share_edge_loops_waiting", "Loops waiting for a supporting loop.", "loops.waiting"),
-    MetricSpec("share_edge_agent_gone", "1 if the agent has left or is silent.", "gone", *_PER_AGENT),
-    MetricSpec(
-        "share_edge_pose_age_seconds", "Age of the newest pose.", "pose_age_ms", *_PER_AGENT, scale=1e-3
-    ),
-    MetricSpec(
-        "share_edge_last_message_age_seconds",
-        "Time since the agent's last message.",
-        "last_received_s",
-        *_PER_AGENT,
-    ),
-    MetricSpec("share_edge_keyframes_total", "Keyframes applied.", "keyframes", *_PER_AGENT),
-    MetricSpec("share_edge_poses_total", "Poses received.", "poses", *_PER_AGENT),
-    MetricSpec("share_edge_evaluations_total", "Evaluations received.", "evaluations", *_PER_AGENT),
-    MetricSpec("share_edge_corrections_total", "Corrections sent.", "corrections", *_PER_AGENT),
-    MetricSpec("share_edge_received_bytes_total", "Bytes received.", "bytes_up", *_PER_AGENT),
-    MetricSpec("share_edge_sent_bytes_total", "Bytes sent.", "bytes_down", *_PER_AGENT),
-    MetricSpec("share_edge_bad_messages_total", "Malformed messages.", "bad_messages", *_PER_AGENT),
-    MetricSpec(
-        "share_edge_unexpected_messages_total", "Messages that only an edge sends.", "unexpected", *_PER_AGENT
-    ),
-    MetricSpec("share_edge_loops_tried_total", "Pairs of views verified.", "loops.tried", *_PER_AGENT),
-    MetricSpec(
-        "share_edge_loops_accepted_total", "Pairs of views accepted as loops.", "loops.accepted", *_PER_AGENT
-    ),
-    MetricSpec("share_edge_merges_total", "Loops added to a map.", "merges.done", *_PER_AGENT),
-    MetricSpec("share_edge_merges_skipped_total", "Loops not added to a map.", "merges.skipped", *_PER_AGENT),
-    MetricSpec(
-        "share_edge_queries_skipped_total",
-        "Keyframes without place recognition.",
-        "queries_skipped",
-        *_PER_AGENT,
-    ),
-    MetricSpec("share_edge_unidentified_bytes_total", "Bytes from unidentified peers.", "unjoined.bytes_up"),
-    MetricSpec(
-        "share_edge_unidentified_bad_messages_total",
-        "Malformed messages from unidentified peers.",
-        "unjoined.bad_messages",
-    ),
-)
-_INFO = ("share_edge_agent_info", "State of an agent as labels; always 1.", ("agent", "kind", "state", "map"))
-_STEPS = ("share_edge_step_seconds", "Duration of a step of the mapper.")
-_QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
-
-
-def render_metrics(report: dict[str, Any]) -> tuple[bytes, str]:
-    """Return the metrics as text and their media type. Metrics that the report lacks are omitted."""
-    from prometheus_client.exposition import choose_encoder
-
-    encode, media_type = choose_encoder("")
-    return encode(_Collector(report)), media_type
-
-
-@dataclass(frozen=True)
-class _Collector:
-    """A collector for prometheus_client."""
-
-    report: dict[str, Any]
-
-    def collect(self) -> Iterator[Metric]:
-        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
-
-        for row in METRICS:
-            kind = CounterMetricFamily if row.name.endswith("_total") else GaugeMetricFamily
-            metric = kind(row.name, row.help, labels=row.labels)
-            for labels, number in _samples(self.report, row):
-                metric.add_metric(labels, number)
-            if metric.samples:
-                yield metric
-        yield _info(self.report)
-        yield _steps(self.report)
-
-
-def _samples(report: dict[str, Any], row: MetricSpec) -> Iterator[tuple[list[str], float]]:
-    for name, entry in _entries(report, row.over):
-        number = _as_number(_lookup(entry, row.path))
-        if number is not None:
-            yield [name, *_labels(entry, row.labels[1:])][: len(row.labels)], number * row.scale
-
-
-def _info(report: dict[str, Any]) -> Metric:
-    from prometheus_client.core import GaugeMetricFamily
-
-    metric = GaugeMetricFamily(_INFO[0], _INFO[1], labels=_INFO[2])
-    for name, agent in _entries(report, "agents"):
-        metric.add_metric([name, *_labels(agent, ("kind", "state", "map_id"))], 1)
-    return metric
-
-
-def _steps(report: dict[str, Any]) -> Metric:
-    """Return a summary of each NAME_ms in the report that has percentiles."""
-    from prometheus_client.core import Metric
-
-    metric = Metric(*_STEPS, typ="summary")
-    for key, times in report.items():
-        if not key.endswith("_ms") or not isinstance(times, dict):
-            continue
-        step, count = {"step": key.removesuffix("_ms")}, _as_number(times.get("n")) or 0.0
-        for name, quantile in _QUANTILES.items():
-            if (ms := _as_number(times.get(name))) is not None:
-                metric.add_sample(_STEPS[0], {**step, "quantile": quantile}, ms * 1e-3)
-        metric.add_sample(f"{_STEPS[0]}_sum", step, count * (_as_number(times.get("mean")) or 0.0) * 1e-3)
-        metric.add_sample(f"{_STEPS[0]}_count", step, count)
-    return metric
-
-
-def _entries(report: dict[str, Any], over: str) -> Iterator[tuple[str, Any]]:
-    if not over:
-        yield "", report
-    elif isinstance(entries := _lookup(report, over), dict):
-        yield from ((str(name), entry) for name, entry in entries.items())
-
-
-def _labels(entry: Any, paths: tuple[str, ...]) -> list[str]:
-    """Return the label values; empty, i.e. absent to Prometheus, where the entry has none."""
-    return ["" if (value := _lookup(entry, path)) is None else str(value) for path in paths]
-
-
-def _lookup(tree: Any, path: str) -> Any:
-    """Return the value at the dotted `path`, None if absent."""
-    for key in path.split(".") if path else ():
-        tree = tree.get(key) if isinstance(tree, dict) else None
-    return tree
-
-
-def _as_number(value: Any) -> float | None:
-    """Return a number, the length of a mapping or list, or None."""
-    if isinstance(value, dict | list | tuple):
-        return float(len(value))
-    return float(value) if isinstance(value, int | float) else None
+_REPORTS = {
+    "/health": _health,
+    "/health/agents": _agents_health,
+    "/metrics": _metrics,
+    "/snapshot.json": _snapshot,
+}
+_PLAN = "/plan.json"

@@ -17,8 +17,7 @@ from dataclasses import dataclass, field
 from email.utils import formatdate
 from http import HTTPStatus
 
-from share.errors import UsageError
-from share.net.transport import Address, bind_error, parse_address
+from share.net.http_guard import HttpGuard, http_address, listen
 
 MAX_CONNECTIONS = 16  # at a time; one more closes the oldest
 MAX_REQUEST_BYTES = 8192
@@ -45,6 +44,7 @@ class Response:
     status: HTTPStatus
     media_type: str
     body: bytes
+    headers: tuple[str, ...] = ()  # further lines
 
     def encode(self, with_body: bool) -> bytes:
         """Return the bytes on the wire."""
@@ -56,25 +56,28 @@ class Response:
             f"Content-Length: {len(self.body)}",
             *_HEADERS,
             *allow,
+            *self.headers,
         ]
         return "\r\n".join([*head, "", ""]).encode() + (self.body if with_body else b"")
 
 
-def text_response(status: HTTPStatus, text: str) -> Response:
+def text_response(status: HTTPStatus, text: str, headers: tuple[str, ...] = ()) -> Response:
     """Return a response of one line of plain text."""
-    return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+    return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode(), headers)
 
 
 class WebServer:
     """Listens on HOST:PORT, or on PORT of this machine alone; port 0 takes a free one. `handler` is called
-    with a path, from the server's thread, and must not raise.
+    with a path, from the server's thread, and must not raise. token: see `HttpGuard`.
 
-    Raises UsageError for a malformed address, TransportError if it cannot be bound.
+    Raises UsageError for a malformed address, or one that others reach without a token; TransportError if it
+    cannot be bound.
     """
 
-    def __init__(self, address: str, handler: Callable[[str], Response]) -> None:
-        self._handler, self._target = handler, _parse(address)
-        self._listener = _listen(self._target)
+    def __init__(self, address: str, handler: Callable[[str], Response], token: str | None = None) -> None:
+        self._handler = handler
+        self._listener, bound = listen(http_address("--http", address, token))
+        self._guard = HttpGuard(bound, token)
         self._wake_sender, self._wake_receiver = socket.socketpair()
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
@@ -82,9 +85,7 @@ class WebServer:
         self._clients: list[_Client] = []  # oldest first
         self._cpu_s = 0.0  # CPU time of the thread so far
         self._thread = threading.Thread(target=self._serve, name="web", daemon=True)
-        self.endpoint = str(Address(self._target.host, self._listener.getsockname()[1])).removeprefix(
-            "tcp://"
-        )
+        self.endpoint = str(bound).removeprefix("tcp://")
         self._thread.start()
 
     def close(self) -> None:
@@ -163,12 +164,11 @@ class WebServer:
         if match is None:
             return text_response(HTTPStatus.BAD_REQUEST, "not an HTTP/1.1 request").encode(True)
         method, path = match[1], match[2].partition("?")[0]
+        refusal = self._guard.check(match[2], _header_fields(rest))
         if method not in ("GET", "HEAD"):
             response = text_response(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD are allowed")
-        elif self._target.local and not _has_local_host_header(rest):
-            response = text_response(
-                HTTPStatus.FORBIDDEN, "only requests for the host name localhost are served"
-            )
+        elif refusal is not None:
+            response = text_response(refusal.status, refusal.text, refusal.headers)
         else:
             response = self._handler(path)
         return response.encode(method != "HEAD")
@@ -209,36 +209,11 @@ class _Client:
         return selectors.EVENT_WRITE
 
 
-def _parse(address: str) -> Address:
-    try:
-        return parse_address(f"tcp://127.0.0.1:{address}" if address.isdigit() else f"tcp://{address}", True)
-    except UsageError:
-        text = f"'{address}' is not an address to serve at; expected HOST:PORT, such as 127.0.0.1:8080"
-        raise UsageError(text) from None
-
-
-def _listen(target: Address) -> socket.socket:
-    family = socket.AF_INET6 if ":" in target.host else socket.AF_INET
-    try:
-        listener = socket.create_server((target.host, target.port), family=family, backlog=MAX_CONNECTIONS)
-    except OSError as error:
-        raise bind_error(target, error.errno, error.strerror or str(error)) from None
-    listener.setblocking(False)
-    return listener
-
-
-def _has_local_host_header(headers: str) -> bool:
-    """Return whether the Host header names this machine only. This refuses a web page that reaches this
-    server by DNS rebinding: it sends its own name."""
-    for field_ in headers.split("\n"):
-        name, _, value = field_.partition(":")
-        if name.lower() == "host":
-            return _is_local_host(value.strip(" \t"))
-    return True
-
-
-def _is_local_host(host: str) -> bool:
-    """host: a name or address, with or without a port. Takes linear time."""
-    host_part, colon, port = host.rpartition(":")
-    name = (host_part if colon and port.isdecimal() else host).strip("[]").lower()
-    return name == "localhost" or Address(name, 0).local
+def _header_fields(text: str) -> dict[str, str]:
+    """Return header fields by name in lower case; of several of one name the first."""
+    fields: dict[str, str] = {}
+    for line in text.split("\n"):
+        name, colon, value = line.partition(":")
+        if colon:
+            fields.setdefault(name.lower(), value.strip(" \t"))
+    return fields

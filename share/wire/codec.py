@@ -259,7 +259,13 @@ _LAYOUTS: dict[type, _Layout] = {
         **{"name": Name, "kind": AgentKind, "run_id": Int64, "streams_frames": bool} | _RIG,
     ),
     m.PoseUpdate: _Layout(
-        2, m.PoseUpdate, _pose("T_keyframe_body"), stamp_ns=Int64, state=TrackState, keyframe=Int64
+        2,
+        m.PoseUpdate,
+        _pose("T_keyframe_body"),
+        stamp_ns=Int64,
+        state=TrackState,
+        keyframe=Int64,
+        age_ms=float,
     ),
     Keyframe: _Layout(
         3,
@@ -300,7 +306,15 @@ _LAYOUTS: dict[type, _Layout] = {
         index=Int64,
         gap_ns=Int64,
     ),
-    m.Status: _Layout(8, m.Status, state=TrackState, pose_age_ms=float, reason=Reason),
+    m.Status: _Layout(
+        8,
+        m.Status,
+        state=TrackState,
+        pose_age_ms=float,
+        reason=Reason,
+        unacknowledged_ms=float,
+        clock_error_ms=float | None,
+    ),
     m.Welcome: _Layout(16, m.Welcome, session=Int64, next_keyframe=Int64),
     m.Refused: _Layout(17, m.Refused, reason=Text),
     m.Ack: _Layout(18, m.Ack, next_keyframe=Int64, buffered=Ids),

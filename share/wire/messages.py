@@ -44,6 +44,11 @@ def _check_image_size(camera: Camera) -> None:
         raise ValueError(f"image: {camera.width}x{camera.height} px exceeds {MAX_IMAGE_SIDE} px a side")
 
 
+def _check_age(name: str, ms: float) -> None:
+    if not 0 <= ms <= MAX_POSE_AGE_MS:
+        raise ValueError(f"{name}: {ms} is outside 0 .. {MAX_POSE_AGE_MS:g}")
+
+
 # ---------------------------------------------------------------- up: agent -> edge
 
 
@@ -70,15 +75,17 @@ class Hello:
 @dataclass(frozen=True, eq=False)
 class PoseUpdate:
     """Sent for every frame: the body's pose (4, 4) relative to the sent keyframe `keyframe`, or in odom if
-    -1."""
+    -1. age_ms: from the frame's arrival to this message."""
 
     stamp_ns: int
     state: TrackState
     keyframe: int
     T_keyframe_body: F64
+    age_ms: float = 0.0
 
     def __post_init__(self) -> None:
         checked_stamp("stamp_ns", self.stamp_ns)
+        _check_age("age_ms", self.age_ms)
         checked_id("keyframe", self.keyframe, minimum=-1)
         object.__setattr__(self, "T_keyframe_body", checked_pose("T_keyframe_body", self.T_keyframe_body))
 
@@ -115,15 +122,21 @@ class Evaluation:
 @dataclass(frozen=True)
 class Status:
     """Sent twice a second and on change, also without frames. pose_age_ms: since the newest frame with a pose
-    arrived, or since the run began. reason: cause of the state, for a person; empty if all is well."""
+    arrived, or since the run began. reason: cause of the state, for a person; empty if all is well.
+    unacknowledged_ms: age of the oldest keyframe that the edge has not acknowledged; 0 without one.
+    clock_error_ms: bound of the error of its estimate of the edge's clock; None: no estimate."""
 
     state: TrackState
     pose_age_ms: float
     reason: str = ""
+    unacknowledged_ms: float = 0.0
+    clock_error_ms: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.pose_age_ms <= MAX_POSE_AGE_MS:
-            raise ValueError(f"pose_age_ms: {self.pose_age_ms} is outside 0 .. {MAX_POSE_AGE_MS:g}")
+        for name in ("pose_age_ms", "unacknowledged_ms"):
+            _check_age(name, getattr(self, name))
+        if self.clock_error_ms is not None:
+            _check_age("clock_error_ms", self.clock_error_ms)
         if len(self.reason) > MAX_REASON_LENGTH or not self.reason.isprintable():
             raise ValueError(f"reason: at most {MAX_REASON_LENGTH} printable characters")
 

@@ -11,7 +11,7 @@ from share.mapping.mapper import Mapper
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddRun, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
-from share.runtime import status_server
+from share.runtime import edge_metrics
 from share.wire import messages as m
 from share.wire.codec import encode
 
@@ -67,7 +67,7 @@ def test_earlier_counts_are_reported_before_the_next_mapper_reports() -> None:
     silent = Edge(Config(), 2).report({})
     added = totals.with_totals(silent)
     assert (added["loops"], added["solve_ms"]) == ({"tried": 5}, {"n": 5})
-    assert b"share_edge_loops_tried_total" not in status_server.render_metrics(added)[0]  # of no agent
+    assert b"share_edge_loops_tried_total" not in edge_metrics.render_metrics(added)[0]  # of no agent
     assert added["agents"] == {}
 
 

@@ -56,14 +56,15 @@ def pictured(out: Path) -> bool:
 def test_a_short_demo_ends_in_one_map(tmp_path):
     """In the plain room, which is quickly drawn; with this seed all three meet after 6 s."""
     seed = ("--scene", "plain", "--seed", "22")
-    done = demo(tmp_path / "cache", tmp_path / "out", "--seconds", "10", *seed)
+    done = demo(tmp_path / "cache", tmp_path / "out", "--seconds", "10", "--no-view", *seed)
     print(done.stdout)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # no progress where nobody watches
     assert re.search(r"3 of 3 agents in one map, joint ATE \d\.\d\d cm", done.stdout)
     (session,) = (tmp_path / "cache" / "share").iterdir()
+    assert "in the map since" in done.stdout and done.stdout.splitlines()[0].count("of frames") == 2
     for name in ("ar1", "ar2", "robot"):
-        assert re.search(rf"^ *{name} ", done.stdout, re.MULTILINE)
+        assert re.search(rf"^ *{name} .* \d+ %  +\d+\.\d s  .* \d+ %", done.stdout, re.MULTILINE)
         report = json.loads((tmp_path / "out" / name / "report.json").read_text())
         assert report["frames"] == FRAMES
         assert report["tracked"] == FRAMES - without_up(session / name)
@@ -77,7 +78,10 @@ def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
     done = demo(plain_cache, tmp_path / "out", "--seconds", "3", "--seed", "18", **hidden)
     assert done.returncode == 0, done.stderr
     assert re.fullmatch(
-        r"share: using the plain room: cannot draw without a screen \(.+\): apt install .+\n", done.stderr
+        r"share: using the plain room: cannot draw without a screen \(.+\): apt install .+\n"
+        r"(share: the live room needs viser: .*\n)?"
+        r"status at http://127\.0\.0\.1:\d+/\n(live room at http://127\.0\.0\.1:\d+/\n)?",
+        done.stderr,
     )
     joined = re.search(r"(\d) of 3 agents in one map(, joint ATE \d\.\d\d cm)?", done.stdout)
     assert joined  # three seconds may be too short to meet: then there is no shared map to draw

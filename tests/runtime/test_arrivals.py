@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.hellos import hello_of
 
 from share.protocol.agent_events import AgentTick
 from share.runtime.arrivals import (
@@ -16,8 +18,9 @@ from share.runtime.arrivals import (
     LatenessMonitor,
     LiveArrivals,
     RecordedArrivals,
+    late_limit_ms,
 )
-from share.types import Frame, ImuBatch
+from share.types import AgentKind, Frame, ImuBatch
 
 _PATIENCE_S = 5.0
 _WHILE_S = 0.3  # in which a thread that is free to decode would
@@ -57,12 +60,12 @@ def test_decoding_ahead_is_bounded() -> None:
 def test_every_frame_comes_in_order_and_the_end_ends_it() -> None:
     count = 3 * READ_AHEAD
     played = RecordedArrivals(_Recording(count).frames, LateFrameDropper(0.0)).iter_frames()
-    assert [frame.index for frame, _ in played] == list(range(count))
+    assert [one.frame.index for one in played] == list(range(count))
 
 
 def test_a_read_error_is_raised_after_the_frames_before_it() -> None:
     played = RecordedArrivals(_Recording(50, broken=40).frames, LateFrameDropper(0.0)).iter_frames()
-    assert [next(played)[0].index for _ in range(40)] == list(range(40))
+    assert [next(played).frame.index for _ in range(40)] == list(range(40))
     with pytest.raises(ValueError, match="cannot be read on"):
         next(played)
 
@@ -110,32 +113,41 @@ def frame_with_imu(k: int) -> Frame:
     return Frame(10 * k * MS, k, IMAGE, imu=ImuBatch(stamps, np.full((2, 3), k), np.full((2, 3), -k)))
 
 
-def test_a_late_frame_is_dropped_if_a_later_one_waits() -> None:
+def test_a_frame_is_late_if_a_later_one_waits() -> None:
     late = LateFrameDropper(20.0)
-    assert late.admit(frame_with_imu(0), 19 * MS, has_next=True) is not None
-    assert late.admit(frame_with_imu(1), 21 * MS, has_next=True) is None
-    assert late.admit(frame_with_imu(2), 21 * MS, has_next=True) is None
-    assert late.dropped == 2
+    judged = [late.judge(frame_with_imu(k), ms * MS, has_next=True)[1] for k, ms in enumerate((19, 21, 21))]
+    assert judged == [False, True, True] and late.dropped == 2
 
 
-def test_the_next_frame_has_all_imu_samples() -> None:
+def test_each_frame_has_all_imu_samples_since_the_last_that_was_tracked() -> None:
     late = LateFrameDropper(20.0)
-    late.admit(frame_with_imu(1), 30 * MS, has_next=True)
-    late.admit(frame_with_imu(2), 30 * MS, has_next=True)
-    taken = late.admit(frame_with_imu(3), 5 * MS, has_next=True)
-    assert taken is not None and taken.index == 3
+    late.judge(frame_with_imu(1), 30 * MS, has_next=True)
+    second, is_late = late.judge(frame_with_imu(2), 30 * MS, has_next=True)
+    assert is_late and second.imu.stamps_ns.tolist() == [10 * MS, 15 * MS, 20 * MS, 25 * MS]
+    taken, is_late = late.judge(frame_with_imu(3), 5 * MS, has_next=True)
+    assert not is_late and taken.index == 3
     assert taken.imu.stamps_ns.tolist() == [10 * MS, 15 * MS, 20 * MS, 25 * MS, 30 * MS, 35 * MS]
     assert taken.imu.gyro[:, 0].tolist() == [1, 1, 2, 2, 3, 3]
     assert taken.imu.accel[:, 0].tolist() == [-1, -1, -2, -2, -3, -3]
-    following = late.admit(frame_with_imu(4), 0, has_next=True)
-    assert following is not None and following.imu.stamps_ns.tolist() == [40 * MS, 45 * MS]
+    following, _ = late.judge(frame_with_imu(4), 0, has_next=True)
+    assert following.imu.stamps_ns.tolist() == [40 * MS, 45 * MS]
 
 
 @pytest.mark.parametrize(("late_ms", "another"), [(0.0, True), (20.0, False)])
-def test_no_frame_is_dropped_without_a_limit_or_a_later_frame(late_ms: float, another: bool) -> None:
+def test_no_frame_is_late_without_a_limit_or_a_later_frame(late_ms: float, another: bool) -> None:
     late = LateFrameDropper(late_ms)
-    assert late.admit(frame_with_imu(1), 10**12, another) is not None
+    frame = frame_with_imu(1)
+    assert late.judge(frame, 10**12, another) == (frame, False)
     assert late.dropped == 0
+
+
+def test_a_headset_with_an_imu_stays_fresh_by_default() -> None:
+    headset, robot = hello_of("ann", 1), hello_of("rob", 2, AgentKind.ROBOT)
+    assert late_limit_ms(None, headset) == 100.0
+    assert late_limit_ms(None, replace(headset, rig=replace(headset.rig, imu=None))) == 0.0
+    assert late_limit_ms(None, replace(headset, streams_frames=True)) == 0.0
+    assert late_limit_ms(None, robot) == late_limit_ms(0.0, headset) == 0.0
+    assert late_limit_ms(50.0, robot) == 50.0
 
 
 # ---------------------------------------------------------------- poses that come late
@@ -143,17 +155,31 @@ def test_no_frame_is_dropped_without_a_limit_or_a_later_frame(late_ms: float, an
 
 def test_poses_in_time_are_not_reported() -> None:
     said: list[str] = []
-    lateness = LatenessMonitor(said.append, "this machine")
-    for _ in range(100):
+    lateness = LatenessMonitor(said.append, "this machine", 50.0)
+    for _ in range(300):
         lateness.record(45.0)
-    assert (said, lateness.report()) == ([], {"late_frames": 0, "max_late_s": 0.045})
+    assert (said, lateness.report()) == ([], {"late_frames": 0, "max_late_s": 0.045, "behind_frames": 0})
+
+
+def test_who_cannot_keep_up_says_so_once_a_minute() -> None:
+    """Headset poses were 3.4 s late, and nothing warned."""
+    said: list[str] = []
+    lateness = LatenessMonitor(said.append, "this machine", 20.0)
+    for k in range(150):
+        lateness.record(25.0 if k % 2 else 6.0)  # half of them: not most
+    assert said == [] and lateness.report()["behind_frames"] == 0
+    for _ in range(2000):
+        lateness.record(25.0)
+    line = "cannot keep up: 51 of the last 100 poses came more than 20 ms after their images; use smaller "
+    assert said[0].startswith(line) and len(said) == 3
+    assert lateness.report()["behind_frames"] == 2000
 
 
 def test_late_poses_are_counted_and_reported_whenever_lateness_doubles() -> None:
     said: list[str] = []
-    lateness = LatenessMonitor(said.append, "this machine")
+    lateness = LatenessMonitor(said.append, "this machine", 1e6)
     for k in range(100):
         lateness.record(100.0 * k)  # to 9.9 s
     assert [line.split(":")[0] for line in said] == [f"poses are {s:.1f} s late" for s in (1, 2, 4, 8)]
-    assert "this machine is too slow for this source; set agent.late_ms" in said[0]
-    assert lateness.report() == {"late_frames": 94, "max_late_s": 9.9}
+    assert "this machine is too slow for this source; use smaller images" in said[0]
+    assert lateness.report() == {"late_frames": 94, "max_late_s": 9.9, "behind_frames": 0}

@@ -5,6 +5,9 @@ from __future__ import annotations
 import resource
 import threading
 import time
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +18,14 @@ from share.config import Config, InertialConfig
 from share.errors import UsageError
 from share.geometry import rig_check, se3
 from share.geometry.camera import ImuBias, Rig
+from share.metrics.frame_log import RunLog
 from share.odometry import filter
 from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
+from share.protocol import agent_events as ev
 from share.runtime import guarded_tracker
+from share.runtime.error_estimators import NoErrorEstimate
+from share.runtime.frame_consumers import LocalTracking
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.types import TrackState
 from share.vision import corners
@@ -246,3 +253,36 @@ def failure() -> Exception:
         raise ValueError("by chance")
     except ValueError as error:
         return error
+
+
+# ---------------------------------------------------------------- frames that come too late
+
+
+@pytest.mark.long
+def test_a_frame_that_is_left_out_has_the_pose_that_the_imu_predicts() -> None:
+    frames = list(rig_fuzzer.walk(24).frames)
+    tracker = GuardedTracker(RIG, Config(), FaultGuard(print))
+    assert tracker.predict(frames[0]) is None  # no pose yet
+    last = [tracker.track(frame).T_odom_body for frame in frames[:19]][-1]
+    late = replace(frames[22], imu=frames[19].imu.concatenate(*(one.imu for one in frames[20:23])))
+    predicted, tracked = tracker.predict(late), tracker.track(late).T_odom_body
+    assert last is not None and predicted is not None and tracked is not None
+    error, moved = se3.inverse(tracked) @ predicted, se3.inverse(tracked) @ last
+    assert np.linalg.norm(moved[:3, 3]) > 0.03  # in four frames
+    assert np.linalg.norm(error[:3, 3]) < 0.2 * np.linalg.norm(moved[:3, 3])
+
+
+@pytest.mark.long
+def test_a_predicted_pose_counts_as_late_as_it_is(walk: rig_fuzzer.Walk) -> None:
+    source: Any = SimpleNamespace(rig=RIG, serial=None, name="walk")
+    posted: list[ev.AgentEvent] = []
+    tracking = LocalTracking(source, Config(), FaultGuard(print), NoErrorEstimate(), RunLog(), print)
+    late_ns = time.monotonic_ns() - 150_000_000
+    tracking.predict(walk.frames[0], late_ns, posted.append)
+    for frame in walk.frames[:5]:
+        tracking.consume(frame, time.monotonic_ns(), posted.append)
+    tracking.predict(walk.frames[5], late_ns, posted.append)
+    frames = [event for event in posted if isinstance(event, ev.FrameTracked)]
+    assert (frames[0].state, frames[0].T_odom_body) == (TrackState.INITIALISING, None)
+    assert frames[-1].state is TrackState.OK and frames[-1].T_odom_body is not None
+    assert all(one.track_ms >= 150 and not one.is_keyframe for one in (frames[0], frames[-1]))

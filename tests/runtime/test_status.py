@@ -25,7 +25,7 @@ from share.mapping.agents.agreement import AgentStanding
 from share.mapping.mapper import Mapper
 from share.protocol.edge import Edge
 from share.protocol.edge_events import AddRun, PeerMessageReceived
-from share.runtime import status_server, web
+from share.runtime import edge_metrics, web
 from share.runtime.status_server import CACHE_S, StatusServer
 from share.wire.codec import encode
 from share.wire.messages import peer_id
@@ -108,6 +108,7 @@ def test_health_lists_present_agents():
     expected = {
         "status": "ok",
         "trouble": [],
+        "agent_trouble": [],
         "refused": [],
         "agents": ["ann"],
         "waiting": 3,
@@ -139,6 +140,41 @@ def test_trouble_makes_health_503():
         status, _, body = get(server, "/health")
     assert status == 503
     assert json.loads(body)["status"] == "trouble" and json.loads(body)["trouble"] == trouble
+
+
+def test_an_agents_trouble_is_trouble_but_no_reason_to_restart_the_edge():
+    report = {**REPORT, "agent_trouble": ["agent 'ann': LOST"]}
+    with serving(lambda: report) as server:
+        for path, expected in (("/health", 200), ("/health/agents", 503)):
+            status, _, body = get(server, path)
+            health = json.loads(body)
+            assert (status, health["status"], health["agent_trouble"]) == (
+                expected,
+                "trouble",
+                ["agent 'ann': LOST"],
+            )
+    with serving() as server:
+        assert get(server, "/health/agents")[0] == 200
+
+
+def test_the_quantiles_of_the_pose_delay_are_metrics():
+    report = {"agents": {"ann": {**AGENT, "pose_ages_ms": TIMES, "qoe": 0.9, "delay_ms": 15.0}}}
+    with serving(lambda: report) as server:
+        samples = metrics(get(server, "/metrics")[2])
+    who = {("agent", "ann"), ("kind", "ar")}
+    assert samples["share_edge_pose_delay_seconds", frozenset(who | {("quantile", "0.95")})] == 0.03
+    assert samples["share_edge_pose_delay_seconds_count", frozenset(who)] == 4
+    assert samples["share_edge_qoe", frozenset(who)] == 0.9
+    assert samples["share_edge_delay_seconds", frozenset(who)] == 0.015
+
+
+def test_the_plan_is_served_beside_the_report():
+    server = StatusServer("0", lambda: REPORT, plan=lambda: {"agents": {"ann": {"position": [1.0, 2.0]}}})
+    try:
+        status, _, body = get(server, "/plan.json")
+        assert status == 200 and json.loads(body)["agents"]["ann"]["position"] == [1.0, 2.0]
+    finally:
+        server.close()
 
 
 def test_snapshot_is_the_report_and_its_age():
@@ -178,35 +214,39 @@ def test_metrics_are_read_back():
 def test_metrics_that_the_report_lacks_are_omitted():
     odd = {"agents": {"ann": {"keyframes": "many"}, "bob": None}, "maps": 3, "loops": None, "x_ms": {"n": 0}}
     for report in ({}, odd):
-        body, _ = status_server.render_metrics(report)
+        body, _ = edge_metrics.render_metrics(report)
         assert all(value == value for value in metrics(body).values())
 
 
 def test_every_metric_has_a_value_in_a_real_report():
-    body, _ = status_server.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
+    body, _ = edge_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
     names = {name for name, _ in metrics(body)}
-    absent = {row.name for row in status_server.METRICS} - names
+    absent = {row.name for row in edge_metrics.METRICS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
     not_yet = {
         "share_edge_map_keyframes",
+        "share_edge_clock_error_seconds",
+        "share_edge_delay_seconds",
+        "share_edge_keyframe_rate_hertz",
         "share_edge_pose_age_seconds",
+        "share_edge_qoe",
         "share_edge_unidentified_bad_messages_total",
     }
     assert absent <= by_others | not_yet
 
 
 def test_names_and_units_are_as_prometheus_wants_them():
-    for row in status_server.METRICS:
+    for row in edge_metrics.METRICS:
         assert re.fullmatch(r"share_edge(_[a-z]+)+", row.name)
-        assert row.help.endswith(".") and len({r.name for r in status_server.METRICS}) == len(
-            status_server.METRICS
+        assert row.help.endswith(".") and len({r.name for r in edge_metrics.METRICS}) == len(
+            edge_metrics.METRICS
         )
 
 
 def test_every_metric_is_in_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "lookup" / "status.md").read_text()
     assert [
-        r.name for r in status_server.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
+        r.name for r in edge_metrics.METRICS if f"`{r.name.removeprefix('share_edge_')}`" not in page
     ] == []
 
 
@@ -222,7 +262,7 @@ def test_the_page_needs_nothing_from_elsewhere():
     with serving() as server:
         status, headers, body = get(server, "/")
     page = body.decode()
-    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 8192
+    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 16384
     assert not re.search(r"https?://|(src|href)=|innerHTML|@import|url\(", page)
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert 'fetch("snapshot.json"' in page
@@ -402,7 +442,24 @@ def test_a_port_in_use_is_reported():
 
 def test_an_address_of_another_machine_is_reported():
     with pytest.raises(TransportError, match="this machine has no such address"):
-        StatusServer("192.0.2.1:0", lambda: REPORT)
+        StatusServer("192.0.2.1:0", lambda: REPORT, token="x" * 20)
+
+
+def test_other_machines_need_a_token():
+    with pytest.raises(UsageError, match="others could read it; add --http-token FILE"):
+        StatusServer("0.0.0.0:0", lambda: REPORT)
+    server = StatusServer("0.0.0.0:0", lambda: REPORT, token="a-token-of-some-length")
+    try:
+        assert get(server, "/health")[0] == 401
+        assert get(server, "/health", headers={"Authorization": "Bearer a-token-of-some-length"})[0] == 200
+        status, headers, _ = get(server, "/?token=a-token-of-some-length")
+        assert (status, headers["Location"]) == (303, "/")
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert get(server, "/", headers={"Cookie": cookie})[0] == 200
+        foreign = {"Cookie": cookie, "Origin": "http://evil.example"}
+        assert get(server, "/", headers=foreign)[0] == 403
+    finally:
+        server.close()
 
 
 def test_dns_rebinding_is_refused():

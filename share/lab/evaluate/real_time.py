@@ -101,10 +101,37 @@ class RunOptions:
         return () if self.config is None else ("--config", self.config)
 
 
+@dataclass(frozen=True)
+class Pages:
+    """What the edge of a run serves to browsers. has_view: the live room beside the status page. show: is
+    called with a line for each page that says where it is."""
+
+    has_view: bool
+    show: Callable[[str], None]
+
+    def edge_arguments(self) -> tuple[str, ...]:
+        return ("--http", "0", *(("--view", "0") if self.has_view else ()))
+
+    def show_addresses(self, log: str) -> None:
+        for line in log.splitlines():
+            if line.startswith(_PAGE_LINES):
+                self.show(line)
+
+
+_PAGE_LINES = ("status at ", "live room at ")  # of the edge
+
+
 def play_in_real_time(
-    session: Session, seconds: float, options: RunOptions, out: Path, show: Callable[[Progress], None]
+    session: Session,
+    seconds: float,
+    options: RunOptions,
+    out: Path,
+    show: Callable[[Progress], None],
+    pages: Pages | None = None,
 ) -> dict[str, Path]:
     """Run `session` in real time and return the folder of each agent's files, by name.
+
+    pages: what to serve meanwhile; None: nothing.
 
     Raises ShareError with the process that failed and the last line of its log, UsageError for a link of an
     unknown agent.
@@ -115,11 +142,15 @@ def play_in_real_time(
     logs = {name: out / f"{name}.log" for name in (*folders, "edge")}
     writable_dir(out, *(log.name for log in logs.values()))
     with ExitStack() as stack:
-        bind = ("--bind", "tcp://127.0.0.1:0", "--out", str(out / "edge"), *options.edge_arguments())
+        served = () if pages is None else pages.edge_arguments()
+        bind = ("--bind", "tcp://127.0.0.1:0", "--out", str(out / "edge"), *options.edge_arguments(), *served)
         edge = stack.enter_context(running_child(logs["edge"], "edge", *bind))
         if options.agents_first:
             os.setpriority(os.PRIO_PROCESS, edge.pid, _EDGE_NICENESS)  # before it starts child processes
-        address = _wait_for_address(edge, logs["edge"])
+        address = _wait_for_line(edge, logs["edge"], r"listening on (tcp://\S+?),")
+        if pages is not None:
+            _wait_for_line(edge, logs["edge"], f"^({_PAGE_LINES[pages.has_view]}.*)\n")
+            pages.show_addresses(_log_text(logs["edge"]))
         agents: Processes = {}
         for number, (name, agent) in enumerate(session.agents.items()):
             identity = (f"{session.folder}/{name}", "--name", name, "--kind", str(agent.kind))
@@ -140,11 +171,12 @@ def play_in_real_time(
     return folders
 
 
-def _wait_for_address(edge: subprocess.Popen[bytes], log: Path) -> str:
-    """Return the address that the edge logs. Raises ShareError if it does not start."""
+def _wait_for_line(edge: subprocess.Popen[bytes], log: Path, pattern: str) -> str:
+    """Return what the first group of `pattern` matches in the edge's log. Raises ShareError if it does not
+    start."""
     deadline = time.monotonic() + EDGE_START_TIMEOUT_S
     while time.monotonic() < deadline:
-        match = re.search(r"listening on (tcp://\S+?),", _log_text(log))
+        match = re.search(pattern, _log_text(log), re.MULTILINE)
         if match:
             return match[1]
         if edge.poll() is not None:

@@ -88,7 +88,7 @@ def run_metrics(trial: Trial) -> RunMetrics:
 def _run_metrics(trial: Trial) -> RunMetrics:
     session_score = score_session(trial.session, trial.folders)
     edge = read_json(trial.folder / "edge" / "edge.json")
-    shared_map_s = _join_times(trial.folder / "edge" / "events.jsonl")
+    shared_map_s = join_times(trial.folder / "edge" / "events.jsonl")
     agents = tuple(
         _agent_metrics(
             name,
@@ -189,7 +189,7 @@ def _rpe(score: AgentScore, measure: Callable[[Trajectory, Trajectory], Rpe]) ->
     return _RpeSummary(100 * rpe.translation.rmse, math.degrees(rpe.rotation.rmse), rpe.translation.n)
 
 
-def _join_times(events: Path) -> dict[str, float]:
+def join_times(events: Path) -> dict[str, float]:
     """Return when each agent first shared a map with another, s since the first agent joined the edge."""
     first_s: float | None = None
     membership = MapMembership()

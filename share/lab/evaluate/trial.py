@@ -20,7 +20,7 @@ from share.errors import ConfigError, DataError, UsageError
 from share.files.json_file import read_json, to_plain
 from share.files.writing import atomic_write, new_folder
 from share.lab.evaluate.provenance import code_digest, describe_machine
-from share.lab.evaluate.real_time import Progress, RunOptions, play_in_real_time
+from share.lab.evaluate.real_time import Pages, Progress, RunOptions, play_in_real_time
 from share.lab.evaluate.virtual_time import play_in_virtual_time
 from share.plain_data import from_mapping, to_mapping
 from share.recordings.session import Session, read_session
@@ -66,10 +66,15 @@ class Trial:
 
 
 def run_trial(
-    session: Session, options: RunOptions, config: Config, out: Path, show: Callable[[Progress], None]
+    session: Session,
+    options: RunOptions,
+    config: Config,
+    out: Path,
+    show: Callable[[Progress], None],
+    pages: Pages | None = None,
 ) -> Trial:
     """Play a session. `out` is complete or absent. The scheduler's random numbers follow the seed of
-    `options`.
+    `options`. pages: what to serve meanwhile, in real time.
 
     Raises UsageError where `out` exists or the session has no truth, ShareError where an agent or the edge
     fails.
@@ -79,9 +84,10 @@ def run_trial(
         atomic_write(work / SETTINGS_FILE, settings_yaml(with_policy(config, options.policy), options.seed))
         began, machine = datetime.now(UTC), describe_machine()
         play_options = dataclasses.replace(options, config=str(work / SETTINGS_FILE))
-        (play_in_virtual_time if options.virtual else play_in_real_time)(
-            session, seconds, play_options, work, show
-        )
+        if options.virtual:
+            play_in_virtual_time(session, seconds, play_options, work, show)
+        else:
+            play_in_real_time(session, seconds, play_options, work, show, pages)
         record = {
             "schema": SCHEMA,
             "session": str(session.folder.resolve()),

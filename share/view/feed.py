@@ -1,0 +1,177 @@
+"""What the edge tells the live room, without ever waiting: a bounded queue that drops its oldest entries.
+
+The edge's loop only appends values that it has anyway; of poses, reports and refusals the newest is kept. A
+thread makes events of them and sends them to the
+viewer's process; if that is slow, this thread waits, and the queue drops.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from share.geometry.camera import Rig
+from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, EdgeEffect, MapperResult, WriteEvent
+from share.protocol.peer import RestoredRun
+from share.types import Keyframe
+from share.view import events as ev
+from share.view import sources
+from share.wire.messages import Hello, PoseUpdate
+
+MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB
+_REPORTED = (
+    *("run", "kind", "state", "reason", "gone", "trouble", "pose_ms", "qoe", "qoe_target", "rate_hz"),
+    *("delay_ms", "map_id", "keyframes", "loops"),
+)
+END = b""
+
+
+class _Keyframe(NamedTuple):
+    run: str
+    keyframe: Keyframe
+    rig: Rig
+
+
+class ViewFeed:
+    """Sends to `connection` until `close`. No method waits or raises.
+
+    on_end: called once from the sender's thread, if the other end is gone before `close`."""
+
+    def __init__(self, connection: Connection, on_end: Callable[[], None] = lambda: None) -> None:
+        self._connection, self._on_end = connection, on_end
+        self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
+        # the newest of each run or agent, not queued
+        self._poses: dict[str, PoseUpdate] = {}
+        self._refusals: dict[str | None, ev.DecisionMade] = {}
+        self._report: ev.AgentsReported | None = None
+        self._sent_stamps: dict[str, int] = {}
+        self._rigs: dict[str, Rig] = {}
+        self._runs: dict[str, ev.RunShown] = {}
+        self._left_out_before = 0  # when runs were sent
+        self.left_out = 0  # entries that were dropped
+        self._wake = threading.Event()
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._send_loop, name="view", daemon=True)
+        self._thread.start()
+
+    # ------------------------------------------------------------------ from the edge's loop
+
+    def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
+        """Start with what a map file holds. known: its runs, which may come back."""
+        self._rigs = {run.key: run.hello.rig for run in known}
+        self._runs = {run.key: _run_shown(run.key, run.hello) for run in known}
+        self._add(ev.SessionBegun(map_file))
+
+    def add_effect(self, effect: EdgeEffect) -> None:
+        match effect:
+            case AddRun():
+                self._rigs[effect.key] = effect.hello.rig
+                self._runs[effect.key] = _run_shown(effect.key, effect.hello)
+                self._add(self._runs[effect.key])
+            case AddKeyframe() if (rig := self._rigs.get(effect.key)) is not None:
+                self._add(_Keyframe(effect.key, effect.keyframe, rig))
+            case DropRun():
+                for known in (self._rigs, self._runs, self._sent_stamps):
+                    known.pop(effect.key, None)
+                self._add(ev.RunRemoved(effect.key))
+            case WriteEvent(fields):
+                self._add_decision(fields)
+
+    def _add_decision(self, fields: Mapping[str, Any]) -> None:
+        """Queue a merge; of refusals, of which there are many, keep the newest of each agent."""
+        if fields["event"] in ev.MERGES:
+            self._add(_decision(fields))
+        elif fields["event"] in ev.REFUSALS:
+            self._refusals[fields["agent"]] = _decision(fields)
+
+    def add_result(self, result: MapperResult) -> None:
+        self._add(result)
+
+    def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None:
+        """Replace the newest poses, by run."""
+        self._poses = dict(poses)
+        self._wake.set()
+
+    def add_report(self, report: Mapping[str, Any]) -> None:
+        """Add edge.json as it is now."""
+        agents = {
+            label: {name: agent.get(name) for name in _REPORTED}
+            for label, agent in report.get("agents", {}).items()
+        }
+        self._report = ev.AgentsReported(agents, tuple(report.get("trouble", ())), self.left_out)
+        self._wake.set()
+
+    def add_event(self, event: ev.RoomEvent) -> None:
+        """Add an event as it is."""
+        self._add(event)
+
+    def close(self, wait_s: float = 1.0) -> None:
+        """End; what is queued is sent for at most `wait_s`. May be repeated."""
+        self._is_closed = True
+        self._wake.set()
+        self._thread.join(wait_s)
+
+    def _add(self, entry: object) -> None:
+        self.left_out += len(self._queue) == MAX_QUEUED
+        self._queue.append(entry)  # drops the oldest
+        self._wake.set()
+
+    # ------------------------------------------------------------------ the sender's thread
+
+    def _send_loop(self) -> None:
+        try:
+            while not (self._is_closed and not self._queue):
+                self._wake.wait()
+                self._wake.clear()
+                for event in self._take_events():
+                    self._connection.send_bytes(pickle.dumps(event, pickle.HIGHEST_PROTOCOL))
+            self._connection.send_bytes(END)
+        except OSError:  # the viewer's process has ended
+            if not self._is_closed:
+                self._on_end()
+
+    def _take_events(self) -> Iterator[ev.RoomEvent]:
+        if self.left_out != self._left_out_before:  # a run may have been among what was dropped
+            self._left_out_before = self.left_out
+            yield from list(self._runs.values())
+        while self._queue:
+            with contextlib.suppress(IndexError):  # dropped in between
+                entry = self._queue.popleft()
+                yield from self._events(entry)
+        while self._refusals:
+            yield self._refusals.pop(next(iter(self._refusals)))
+        if (report := self._report) is not None:
+            self._report = None
+            yield report
+        for run, pose in self._poses.items():
+            if self._sent_stamps.get(run) != pose.stamp_ns:
+                self._sent_stamps[run] = pose.stamp_ns
+                yield ev.PoseShown(run, pose.state, pose.keyframe, pose.T_keyframe_body, pose.age_ms)
+
+    def _events(self, entry: object) -> Iterator[ev.RoomEvent]:
+        match entry:
+            case _Keyframe():
+                yield sources.keyframe_shown(*entry)
+            case MapperResult():
+                for change in entry.changes:
+                    if (shown := sources.change_shown(change)) is not None:
+                        yield shown
+                for finding in entry.findings:
+                    if (correction := sources.finding_shown(finding)) is not None:
+                        yield correction
+            case _ if isinstance(entry, ev.RoomEvent):
+                yield entry
+
+
+def _run_shown(run: str, hello: Hello) -> ev.RunShown:
+    return sources.run_shown(run, hello.name, hello.kind, hello.rig)
+
+
+def _decision(fields: Mapping[str, Any]) -> ev.DecisionMade:
+    return ev.DecisionMade(fields["t_s"], fields["event"], fields["agent"], fields["reason"])

@@ -1,0 +1,133 @@
+"""The side panel: a block of HTML for each agent. Whatever comes from outside is escaped."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+from share.protocol.agent_health import LIMITS
+from share.types import AgentKind
+from share.view import events as ev
+from share.view.drawing import Colour
+from share.view.room import LastCorrection, Room
+
+_MOST_LIMITS = 5.0  # height of a sparkline, in limits; what is later touches its top
+_AGES_SHOWN = 150  # poses in a sparkline: ten seconds at 15 Hz
+_WIDTH, _HEIGHT = 240.0, 34.0  # px, of a sparkline
+_BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
+_NAME = f"{_DIM};padding-right:8px;vertical-align:top"
+_BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
+_SPARKLINE = "width:100%;max-width:320px;display:block;overflow:visible"
+_LINES_SHOWN = 4  # newest merges
+
+
+@dataclass
+class _AgentHistory:
+    ages_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_AGES_SHOWN))
+    decision: str = ""
+
+
+class Panel:
+    """Collects what is said of agents. Times are the viewer's, s."""
+
+    def __init__(self) -> None:
+        self._history: dict[str, _AgentHistory] = {}  # by name
+        self._names: dict[str, str] = {}  # by run
+        self._report = ev.AgentsReported()
+        self._merges: deque[str] = deque(maxlen=_LINES_SHOWN)
+
+    @property
+    def agents(self) -> dict[str, str]:
+        """Names of the agents that are present, by run."""
+        return {a["run"]: label for label, a in self._report.agents.items() if not a["gone"]}
+
+    def apply(self, event: ev.RoomEvent) -> None:
+        match event:
+            case ev.RunShown():
+                self._names[event.run] = event.name
+            case ev.PoseShown() if event.age_ms is not None:
+                self._of(self._names.get(event.run, event.run)).ages_ms.append(event.age_ms)
+            case ev.DecisionMade():
+                if event.agent is not None:
+                    self._of(event.agent).decision = f"{event.event}: {event.reason}"
+                if event.event in ev.MERGES:
+                    who = "" if event.agent is None else f" {event.agent}:"
+                    self._merges.append(f"{event.t_s:.1f} s {event.event}:{who} {event.reason}")
+            case ev.AgentsReported():
+                self._report = event
+
+    def html(self, room: Room, now_s: float) -> str:
+        """Return the panel as it is now."""
+        parts = [f'<div style="color:{_BAD}">{escape(line)}</div>' for line in self._report.trouble]
+        if self._report.left_out:
+            text = f"this view was too slow for {self._report.left_out} updates, which are not shown"
+            parts.append(f'<div style="color:{_BAD}">{text}</div>')
+        for label, agent in sorted(self._report.agents.items(), key=lambda item: (item[1]["gone"], item[0])):
+            run = room.runs.get(agent["run"])
+            colour = (128, 128, 128) if run is None else room.colour(run)
+            parts.append(self._agent(label, agent, colour, room.corrections.get(agent["run"]), now_s))
+        if self._merges:
+            lines = "".join(f"<div>{escape(line)}</div>" for line in reversed(self._merges))
+            parts.append(f'<div style="margin-top:8px"><b>merges</b>{lines}</div>')
+        body = "".join(parts) or "no agent yet"
+        return f'<div style="{_BODY}">{body}</div>'
+
+    def _of(self, name: str) -> _AgentHistory:
+        return self._history.setdefault(name, _AgentHistory())
+
+    def _agent(
+        self, label: str, agent: Any, colour: Colour, corrected: LastCorrection | None, now_s: float
+    ) -> str:
+        history, limit_ms = self._of(label), LIMITS[AgentKind(agent["kind"])].pose_ms
+        state = "gone" if agent["gone"] else agent["state"]
+        ages = tuple(history.ages_ms)
+        rate = "" if agent["rate_hz"] is None else f", at most {agent['rate_hz']:.1f} Hz"
+        rows = [("keyframes", f"{agent['keyframes']}{rate}")]
+        if agent["qoe"] is not None:
+            rows.insert(0, ("QoE", f"{agent['qoe']:.2f} (target {agent['qoe_target']:.2f})"))
+        if agent["delay_ms"] is not None:
+            rows.append(("delay", f"{agent['delay_ms']:.0f} ms"))
+        if agent["pose_ms"] is not None:
+            rows.append(("pose age", f"{agent['pose_ms']:.1f} ms, limit {limit_ms:.0f} ms"))
+        if corrected is not None:
+            how_far = f"{1e3 * corrected.moved_m:.0f} mm, {max(0.0, now_s - corrected.at_s):.0f} s ago"
+            rows.append(("correction", how_far))
+        if agent["map_id"] is not None:
+            rows.append(("map", str(agent["map_id"])))
+        cells = "".join(
+            f'<tr><td style="{_NAME}">{name}</td><td>{escape(value)}</td></tr>' for name, value in rows
+        )
+        swatch = "rgb({}, {}, {})".format(*colour)
+        is_bad = state in ("LOST", "SILENT") or bool(agent["trouble"])
+        who = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
+        state_colour = "inherit" if agent["gone"] else _BAD if is_bad else _GOOD
+        how = f'<b style="color:{state_colour}">{escape(state)}</b>'
+        head = f'<div><span style="color:{swatch}">&#9632;</span> {who} {how}</div>'
+        if agent["gone"]:
+            return f'<div style="opacity:.5;margin:0 0 10px">{head}</div>'
+        faults = "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
+        decision = f'<div style="{_DIM}">{escape(history.decision)}</div>' if history.decision else ""
+        return (
+            f'<div style="margin:0 0 10px">{head}{faults}{sparkline(ages, limit_ms, swatch)}'
+            f"<table>{cells}</table>{decision}</div>"
+        )
+
+
+def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:
+    """Return an SVG of values over time, with a dashed line at `limit`; "" without values."""
+    if not values:
+        return ""
+    top = limit * min(_MOST_LIMITS, max(2.0, *(value / limit for value in values)))
+    step = _WIDTH / (_AGES_SHOWN - 1)
+    y = [_HEIGHT * (1 - min(value, top) / top) for value in values]
+    points = " ".join(f"{step * k:.1f},{height:.1f}" for k, height in enumerate(y))
+    limit_y = _HEIGHT * (1 - limit / top)
+    line = f'<line x1="0" x2="{_WIDTH:.0f}" y1="{limit_y:.1f}" y2="{limit_y:.1f}"'
+    return (
+        f'<svg viewBox="0 0 {_WIDTH + 34:.0f} {_HEIGHT:.0f}" style="{_SPARKLINE}">'
+        f'{line} stroke="{_BAD}" stroke-dasharray="4 3"/>'
+        f'<text x="{_WIDTH + 3:.0f}" y="{limit_y + 3:.1f}" font-size="9" fill="{_BAD}">{limit:.0f} ms</text>'
+        f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.3"/></svg>'
+    )

@@ -1,0 +1,375 @@
+"""The room as a viewer draws it: events in, drawings of what has changed out.
+
+It uses no clock, socket or file. Maps that are not joined yet stand beside each other; when two merge, one
+moves into the other. A change names chunks of keyframes, paths and loops; a chunk is drawn once, however
+often it changed since the last time, and only so many at a time: a viewer is never given a backlog.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from share.mapping.loops import KeyframeKey
+from share.types import F64
+from share.view import drawing as dr
+from share.view import events as ev
+from share.view.agent_paths import PlacedKeyframe, RunPath
+from share.view.loop_lines import LoopLines
+from share.view.shapes import frusta, lines, named, shifted
+
+COLOURS: tuple[dr.Colour, ...] = (  # of agents, told apart also by those who see few colours (Okabe and Ito)
+    *((86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66)),
+    *((213, 94, 0), (204, 121, 167), (0, 114, 178), (190, 190, 190)),
+)
+_LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
+_MAP_SPACING_M = 10.0  # between maps that are not joined
+_MAX_CHUNKS = 12  # drawn at a time
+_FLASH_S, _TEXT_S = 1.5, 8.0  # how long a loop or correction, and a merge, stand out
+_LEAST_CORRECTION_M = 0.005  # that is marked
+_FLOOR_STEP_M = 0.3  # a lower floor is not drawn again for less
+_FLOOR_MARGIN_M, _MOST_SPARE_M = 1.0, 6.0
+
+
+@dataclass(frozen=True)
+class LastCorrection:
+    """When a correction came, and by how much it moved the agent."""
+
+    at_s: float
+    moved_m: float
+
+
+class Room:
+    """All runs, their keyframes and loops. Times are the viewer's, s."""
+
+    def __init__(self) -> None:
+        self._drawn: set[str] = set()
+        self._next_number = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin without a map; what is drawn is to be removed."""
+        self.runs: dict[str, RunPath] = {}
+        self.corrections: dict[str, LastCorrection] = {}  # by run
+        self._loops = LoopLines()
+        self._slots: dict[str, int] = {}  # place of each map, beside each other
+        # how to draw what has changed, by name
+        self._dirty: dict[str, Callable[[], list[dr.Drawing]]] = dict.fromkeys(self._drawn, _nothing)
+        self._temporary: dict[str, float] = {}  # until when things are shown, by name
+        self._moved_runs: set[str] = set()
+        self._pictures: dict[str, bytes] = {}
+        self._lows: dict[str, F64] = {}  # corner and floor of each chunk of keyframes: x, y, z, x, y
+        self._floor: dr.FloorGrid | None = None
+        self._said: list[dr.Announcement] = []
+
+    # ------------------------------------------------------------------ events
+
+    def apply(self, event: ev.RoomEvent, now_s: float) -> None:
+        match event:
+            case ev.SessionBegun():
+                self._begin()
+            case ev.RunShown():
+                self._add_run(event)
+            case ev.KeyframeShown():
+                self._add_keyframe(event)
+            case ev.PoseShown():
+                self._add_pose(event)
+            case ev.CorrectionShown():
+                self._correct(event, now_s)
+            case ev.MapsSolved():
+                self._solve(event)
+            case ev.LoopAccepted():
+                self._add_loop(event.a, event.b, now_s)
+            case ev.LoopsRemoved():
+                self._mark_loops(self._loops.remove(event.a, event.b))
+            case ev.KeyframesRemoved():
+                for key in event.keys:
+                    self._remove_keyframe(key)
+            case ev.RunRemoved():
+                self._remove_run(event.run)
+            case ev.DecisionMade():
+                self._announce(event, now_s)
+            case ev.AgentsReported():
+                self._update_presence(event)
+
+    def _add_run(self, event: ev.RunShown) -> None:
+        if event.run not in self.runs:
+            self.runs[event.run] = RunPath(self._next_number, event)
+            self._next_number += 1
+
+    def _add_keyframe(self, event: ev.KeyframeShown) -> None:
+        if (run := self.runs.get(event.key.agent)) is None or event.key.id in run.keyframes:
+            return
+        one = run.add_keyframe(event)
+        if event.jpeg:
+            self._pictures[event.key.agent] = event.jpeg
+        if one.T_map_body is not None:
+            self._mark(event.key.agent, one)
+        self._arrange_maps()
+
+    def _add_pose(self, event: ev.PoseShown) -> None:
+        if (run := self.runs.get(event.run)) is None:
+            return
+        self._moved_runs.add(event.run)
+        if (chunk := run.add_pose(event)) is not None:
+            self._mark_path(event.run, chunk)
+        if (oldest := run.forget_oldest_path()) is not None:
+            self._mark_path(event.run, oldest)
+
+    def _correct(self, event: ev.CorrectionShown, now_s: float) -> None:
+        if (run := self.runs.get(event.run)) is None:
+            return
+        before = run.place()
+        moved = run.correct(event.map_id, event.T_map_odom, event.segment_keyframe)
+        for one in moved:
+            self._mark(event.run, one)
+        self._moved_runs.add(event.run)
+        self._arrange_maps()
+        after = run.place()
+        if before is None or after is None or before[0] != after[0]:
+            return
+        moved_m = float(np.linalg.norm(after[1][:3, 3] - before[1][:3, 3]))
+        self.corrections[event.run] = LastCorrection(now_s, moved_m)
+        if moved_m >= _LEAST_CORRECTION_M:
+            ends = np.array([[before[1][:3, 3], after[1][:3, 3]]]) + self._offset(after[0])
+            self._show_for(
+                f"/corrections/{run.number}", lines(ends, _CORRECTION_COLOUR, 5.0), now_s, _FLASH_S
+            )
+
+    def _solve(self, event: ev.MapsSolved) -> None:
+        poses = event.poses
+        for key, map_id, T in zip(poses.keys, poses.map_ids, poses.T_map_body, strict=True):
+            one = None if (run := self.runs.get(key.agent)) is None else run.keyframes.get(key.id)
+            if one is not None and one.place(map_id, T, True):
+                self._mark(key.agent, one)
+                self._moved_runs.add(key.agent)
+        self._arrange_maps()
+
+    def _add_loop(self, a: KeyframeKey, b: KeyframeKey, now_s: float) -> None:
+        chunk = self._loops.add(a, b)
+        for key in (a, b):
+            if (one := self._keyframe(key)) is not None:
+                one.loop_chunks.add(chunk)
+        self._mark_loops({chunk})
+        if (ends := self._loop_ends([(a, b)])) is not None:
+            self._show_for(
+                f"/loops/new/{self._loops.count}", lines(ends, _FLASH_COLOUR, 6.0), now_s, _FLASH_S
+            )
+
+    def _remove_keyframe(self, key: KeyframeKey) -> None:
+        if (run := self.runs.get(key.agent)) is not None and (one := run.remove_keyframe(key.id)) is not None:
+            self._mark(key.agent, one)
+            self._mark_loops(self._loops.remove_keyframe(key))
+
+    def _remove_run(self, name: str) -> None:
+        if (run := self.runs.get(name)) is None:
+            return
+        for id_ in list(run.keyframes):
+            self._remove_keyframe(KeyframeKey(name, id_))
+        for chunk in run.path_chunks:
+            self._dirty[f"/paths/{run.number}/{chunk}"] = _nothing
+        self._dirty[f"/agents/{run.number}"] = _nothing
+        del self.runs[name]
+        self.corrections.pop(name, None)
+        self._arrange_maps()
+
+    def _update_presence(self, event: ev.AgentsReported) -> None:
+        for entry in event.agents.values():
+            is_current = not entry["gone"] and entry["state"] not in ("LOST", "SILENT")
+            if (run := self.runs.get(entry["run"])) is not None and run.is_current != is_current:
+                run.is_current = is_current
+                self._moved_runs.add(entry["run"])
+
+    def _announce(self, event: ev.DecisionMade, now_s: float) -> None:
+        if event.event not in ev.MERGES:
+            return
+        title = event.event if event.agent is None else f"{event.event}: {event.agent}"
+        self._said.append(dr.Announcement(title, event.reason))
+        for run in reversed(self.runs.values()):
+            if run.shown.name == event.agent and (place := run.place()) is not None:
+                position = place[1][:3, 3] + self._offset(place[0]) + (0.0, 0.0, 0.5)
+                self._show_for("/texts/merge", dr.Text("", title, position), now_s, _TEXT_S)
+                return
+
+    # ------------------------------------------------------------------ what has changed
+
+    def _mark(self, run_key: str, one: PlacedKeyframe) -> None:
+        """Mark all that is drawn with a keyframe."""
+        run = self.runs[run_key]
+        for kind in ("points", "keyframes"):
+            name = f"/{kind}/{run.number}/{one.chunk}"
+            self._dirty[name] = partial(self._draw_keyframes, run, one.chunk, kind, name)
+        for chunk in one.path_chunks:
+            self._mark_path(run_key, chunk)
+        self._mark_loops(one.loop_chunks)
+
+    def _mark_path(self, run_key: str, chunk: int) -> None:
+        run = self.runs[run_key]
+        name = f"/paths/{run.number}/{chunk}"
+        self._dirty[name] = partial(self._draw_path, run, chunk, name)
+
+    def _mark_loops(self, chunks: Iterable[int]) -> None:
+        for chunk in chunks:
+            name = f"/loops/{chunk}"
+            self._dirty[name] = partial(self._draw_loops, chunk, name)
+
+    def _show_for(self, name: str, thing: dr.Lines | dr.Text, now_s: float, duration_s: float) -> None:
+        """Show something for a while."""
+        self._temporary[name] = now_s + duration_s
+        shown: list[dr.Drawing] = [named(thing, name)]
+        self._dirty[name] = lambda: shown
+
+    def _arrange_maps(self) -> None:
+        """Give each map its place: the first at the origin, the others beside it."""
+        used = dict.fromkeys(
+            one.map_id
+            for run in self.runs.values()
+            for chunk in run.chunks.values()
+            for one in chunk[-1:]
+            if one.T_map_body is not None
+        )
+        kept = [map_id for map_id in self._slots if map_id in used]
+        slots = {map_id: k for k, map_id in enumerate([*kept, *(m for m in used if m not in kept)])}
+        moved = {map_id for map_id, slot in slots.items() if self._slots.get(map_id, slot) != slot}
+        self._slots = slots
+        for key, run in self.runs.items():
+            for one in run.keyframes.values() if moved else ():
+                if one.map_id in moved:
+                    self._mark(key, one)
+                    self._moved_runs.add(key)
+
+    def _offset(self, map_id: str) -> F64:
+        return np.array([0.0, _MAP_SPACING_M * self._slots.get(map_id, 0), 0.0])
+
+    # ------------------------------------------------------------------ drawings
+
+    def take_drawings(self, now_s: float) -> list[dr.Drawing]:
+        """Return what has changed since the last call."""
+        out: list[dr.Drawing] = [*self._said]
+        self._said = []
+        for name in [name for name, until_s in self._temporary.items() if now_s >= until_s]:
+            del self._temporary[name]
+            self._dirty[name] = _nothing
+        for key in sorted(self._moved_runs):
+            if (run := self.runs.get(key)) is not None and (body := self._draw_body(run)):
+                out.append(body)
+                if key in self._pictures:
+                    out.append(dr.Picture(body.name, self._pictures.pop(key)))
+        self._moved_runs.clear()
+        for name in list(self._dirty)[:_MAX_CHUNKS]:
+            things = self._dirty.pop(name)()
+            out += things
+            if things:
+                self._drawn.add(name)
+            elif name in self._drawn:
+                self._drawn.remove(name)
+                out.append(dr.Removed(name))
+        if (floor := self._new_floor()) is not None:
+            out.append(floor)
+        return out
+
+    @property
+    def waiting(self) -> int:
+        """Number of things that have changed and are not drawn yet."""
+        return len(self._dirty)
+
+    def agent_place(self, run_key: str) -> F64 | None:
+        """Return T_room_body (4, 4) of a run; None if unknown."""
+        place = None if (run := self.runs.get(run_key)) is None else run.place()
+        return None if place is None else shifted(place[1], self._offset(place[0]))
+
+    def colour(self, run: RunPath) -> dr.Colour:
+        """Return the colour of an agent: that of its first run."""
+        names = list(dict.fromkeys(other.shown.name for other in self.runs.values()))
+        return COLOURS[names.index(run.shown.name) % len(COLOURS)]
+
+    def _draw_body(self, run: RunPath) -> dr.Body | None:
+        if (place := run.place()) is None:
+            return None
+        shown = run.shown
+        T, is_current = shifted(place[1], self._offset(place[0])), run.state.has_pose and run.is_current
+        name, colour = f"/agents/{run.number}", self.colour(run)
+        self._drawn.add(name)
+        return dr.Body(
+            name, shown.name, shown.kind, T, shown.T_body_cam0, shown.half_angles, colour, is_current
+        )
+
+    def _draw_keyframes(self, run: RunPath, chunk: int, kind: str, name: str) -> list[dr.Drawing]:
+        placed = [(one, T) for one in run.chunks[chunk] if (T := self._T_room(one)) is not None]
+        self._lows.pop(name, None)
+        if not placed:
+            return []
+        T = np.array([T for _, T in placed])
+        origin = T[:, :3, 3].mean(axis=0)
+        T[:, :3, 3] -= origin
+        if kind == "keyframes":
+            return [dr.Lines(name, origin, frusta(T, run.shown), self.colour(run), 1.5)]
+        points = np.concatenate(
+            [one.points @ R.T + t for (one, _), R, t in zip(placed, T[:, :3, :3], T[:, :3, 3], strict=True)]
+        )
+        if not len(points):
+            return []
+        low, high = np.percentile(points, [2, 98], axis=0) + origin
+        self._lows[name] = np.concatenate([low, high[:2]])
+        return [dr.Points(name, origin, points.astype(np.float32), self.colour(run))]
+
+    def _draw_path(self, run: RunPath, chunk: int, name: str) -> list[dr.Drawing]:
+        placed = run.path(chunk)
+        if len(placed) < 2:
+            return []
+        points = np.array([position + self._offset(map_id) for map_id, position in placed])
+        same_map = np.array([a[0] == b[0] for a, b in pairwise(placed)])
+        segments = np.stack([points[:-1], points[1:]], axis=1)[same_map]
+        return [named(lines(segments, self.colour(run), 3.0), name)] if len(segments) else []
+
+    def _draw_loops(self, chunk: int, name: str) -> list[dr.Drawing]:
+        ends = self._loop_ends(self._loops.chunk(chunk))
+        return [] if ends is None else [named(lines(ends, _LOOP_COLOUR, 2.0), name)]
+
+    def _loop_ends(self, loops: Iterable[tuple[KeyframeKey, KeyframeKey]]) -> F64 | None:
+        """Return the ends (N, 2, 3) of loops whose keyframes are placed; None without one."""
+        out = []
+        for pair in loops:
+            ends = [T[:3, 3] for key in pair if (T := self._T_room(self._keyframe(key))) is not None]
+            if len(ends) == 2:
+                out.append(ends)
+        return np.array(out) if out else None
+
+    def _T_room(self, one: PlacedKeyframe | None) -> F64 | None:
+        """Return the pose (4, 4) of a keyframe in the room; None if unknown."""
+        if one is None or one.T_map_body is None:
+            return None
+        return shifted(one.T_map_body, self._offset(one.map_id))
+
+    def _keyframe(self, key: KeyframeKey) -> PlacedKeyframe | None:
+        return None if (run := self.runs.get(key.agent)) is None else run.keyframes.get(key.id)
+
+    def _new_floor(self) -> dr.FloorGrid | None:
+        """Return the floor where it has to be drawn again: below the lowest points, about as wide as the
+        maps."""
+        if not self._lows:
+            return None
+        corners = np.array(list(self._lows.values()))
+        z = float(np.percentile(corners[:, 2], 10))
+        low, high = corners[:, :2].min(axis=0) - _FLOOR_MARGIN_M, corners[:, 3:].max(axis=0) + _FLOOR_MARGIN_M
+        old = self._floor
+        if old is not None and abs(z - old.z) < _FLOOR_STEP_M:
+            spare = np.concatenate([low - old.low, old.high - high])  # on each side
+            if (spare >= 0).all() and (spare < _MOST_SPARE_M).all():
+                return None
+        margin = 0.0 if old is None else 1.5  # it grows by steps
+        low, high = np.floor(low - margin), np.ceil(high + margin)
+        self._floor = dr.FloorGrid(z, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+        return self._floor
+
+    @property
+    def floor(self) -> dr.FloorGrid | None:
+        return self._floor
+
+
+def _nothing() -> list[dr.Drawing]:
+    return []

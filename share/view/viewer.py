@@ -1,0 +1,164 @@
+"""The live room's process: takes events, draws what has changed at most fifteen times a second.
+
+It has the lowest priority and ends with the process that started it, which it can neither hold up nor end.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from typing import Any
+
+from share.errors import ShareError, UsageError
+from share.net.http_guard import HttpGuard, http_address, listen
+from share.net.transport import Address
+from share.spawning import SPAWN_CONTEXT
+from share.view.events import SessionBegun
+from share.view.feed import END, ViewFeed
+
+DRAW_HZ = 15.0
+_PANEL_S = 0.5  # between updates of the panel
+_NICENESS = 15
+_STOP_S = 2.0
+_MAX_EVENTS = 400  # applied before something is drawn
+MISSING = "the live room needs viser: pip install 'viser>=1.1,<2'"
+
+
+def is_installed() -> bool:
+    return find_spec("viser") is not None
+
+
+class LiveRoom:
+    """A viewer's process, and the feed to it. `close` may be repeated.
+
+    address: HOST:PORT, or a PORT of this machine. token: as in `http_guard`; None: none is needed. notify: is
+    called with a line if the process ends by itself.
+    Raises UsageError where viser is missing or the address is malformed, TransportError if it cannot be
+    bound.
+    """
+
+    def __init__(
+        self, address: str, token: str | None, title: str, notify: Callable[[str], None] = lambda text: None
+    ) -> None:
+        if not is_installed():
+            raise UsageError(f"--view: {MISSING}")
+        listener, bound = listen(http_address("--view", address, token))
+        self.endpoint = str(bound).removeprefix("tcp://")
+        parent_end, child_end = SPAWN_CONTEXT.Pipe()
+        self._process = SPAWN_CONTEXT.Process(
+            target=_run, args=(child_end, listener, bound, token, title), name="view", daemon=True
+        )
+        self._process.start()
+        child_end.close()
+        listener.close()
+        self._connection = parent_end
+        self.feed = ViewFeed(parent_end, lambda: notify("the live room has ended; the edge goes on"))
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    def close(self) -> None:
+        """End the process."""
+        self.feed.close()
+        self._process.join(_STOP_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._connection.close()
+
+
+def _run(
+    connection: Connection, listener: socket.socket, bound: Address, token: str | None, title: str
+) -> None:
+    """Entry point of the process."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
+    os.nice(_NICENESS)
+    _silence_output()
+    from share.view.window import Window
+
+    listener.setblocking(False)
+    window = Window(listener, HttpGuard(bound, token), title)
+    try:
+        Viewer(connection, window).run()
+    except (EOFError, OSError):  # the parent has ended
+        pass
+    finally:
+        os._exit(0)  # threads of viser would keep the process
+
+
+def _silence_output() -> None:
+    """Discard what libraries print: this process says nothing on its parent's terminal."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    sys.stdout.flush()
+    for stream in (1, 2):
+        os.dup2(null, stream)
+    os.close(null)
+
+
+class Viewer:
+    """Applies events to a room and draws it."""
+
+    def __init__(self, connection: Connection, window: Any) -> None:
+        from share.view.panel import Panel
+        from share.view.room import Room
+
+        self._connection, self._window = connection, window
+        self._room, self._panel = Room(), Panel()
+        self._panel_due_s = 0.0
+        self._is_ended = False
+
+    def run(self) -> None:
+        """Draw until the feed ends. Raises EOFError or OSError if the other process has died."""
+        while not self._is_ended:
+            start_s = time.monotonic()
+            self._take_events(start_s)
+            self._draw(time.monotonic())
+            time.sleep(max(0.005, 1 / DRAW_HZ - (time.monotonic() - start_s)))
+
+    def _take_events(self, now_s: float) -> None:
+        for _ in range(_MAX_EVENTS):
+            if not self._connection.poll():
+                return
+            data = self._connection.recv_bytes()
+            if data == END:
+                self._is_ended = True
+                return
+            event = pickle.loads(data)  # of our own parent process
+            self._apply(event, now_s)
+            if isinstance(event, SessionBegun) and event.map_file is not None:
+                self._load(event, now_s)
+
+    def _load(self, event: SessionBegun, now_s: float) -> None:
+        from share.view.sources import map_file_shown
+
+        assert event.map_file is not None
+        try:
+            for stored in map_file_shown(event.map_file):
+                self._apply(stored, now_s)
+        except ShareError:
+            pass  # the edge says what is wrong with it
+
+    def _apply(self, event: Any, now_s: float) -> None:
+        self._panel.apply(event)
+        self._room.apply(event, now_s)
+
+    def _draw(self, now_s: float) -> None:
+        if drawings := self._room.take_drawings(now_s):
+            self._window.draw(drawings)
+        agents = self._panel.agents
+        self._window.follow(lambda name: self._place(agents, name))
+        if now_s >= self._panel_due_s:
+            self._panel_due_s = now_s + _PANEL_S
+            self._window.show_panel(self._panel.html(self._room, now_s), sorted(agents.values()))
+
+    def _place(self, agents: Mapping[str, str], name: str) -> Any:
+        run = next((run for run, label in agents.items() if label == name), None)
+        return None if run is None else self._room.agent_place(run)

@@ -1,0 +1,329 @@
+"""The page: draws in a browser by viser, which keeps for each browser only what it has not drawn yet."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+
+from share.errors import DataError
+from share.geometry.se3 import quat_from_matrix
+from share.net.http_guard import HttpGuard
+from share.types import F64, AgentKind
+from share.view import drawing as dr
+from share.vision.image_codec import decode_gray
+
+_MAX_MESSAGE_BYTES = 2**20  # from a browser, which sends its camera and what is chosen
+MAX_BROWSERS = 16
+_GREY = (110, 110, 110)
+_POINT_M = 0.03
+_FRUSTUM_SIZE = 0.5
+_ROBOT_RADIUS_M, _ROBOT_HEIGHT_M = 0.17, 0.2  # a TurtleBot 4
+_PICTURE_PX = 160  # width
+_ORBIT, _ABOVE, _FOLLOW = "orbit", "from above", "follow "
+_SEEN_SHARE = 0.7  # distance of the camera, in diagonals of the room
+_START = (np.array([-3.0, -4.0, 3.0]), np.array([0.0, 0.0, 0.0]))
+
+
+class Window:
+    """Serves the page on a listening socket. Methods are called from one thread."""
+
+    def __init__(self, listener: socket.socket, guard: HttpGuard, title: str) -> None:
+        with _guarded_serving(listener, guard, lambda: self._browser_count):
+            import viser
+
+            self._browser_count = 0
+            self._server = viser.ViserServer(verbose=False, label=title)
+        from viser import _messages
+
+        for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel to the internet
+            self._server._websock_server._incoming_handlers.pop(message, None)
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._server.scene.set_up_direction("+z")
+        self._panel = self._server.gui.add_html("")
+        self._panel_html = ""
+        self._frames: dict[str, Any] = {}  # nodes of bodies by name, with the colour that they were drawn in
+        self._colours: dict[str, tuple[dr.Colour, str]] = {}
+        self._cameras: dict[int, _BrowserCamera] = {}
+        self._followed: tuple[str, ...] = ()
+        self._floor: dr.FloorGrid | None = None
+        self._server.on_client_connect(self._open)
+        self._server.on_client_disconnect(self._close)
+
+    def _open(self, client: Any) -> None:
+        """Called by viser, from a thread of its own."""
+        self._browser_count += 1
+        camera = _BrowserCamera(client, self._followed)
+        camera.look_at_room(self._floor)
+        self._cameras[client.client_id] = camera
+
+    def _close(self, client: Any) -> None:
+        self._browser_count -= 1
+        self._cameras.pop(client.client_id, None)
+
+    def stop(self) -> None:
+        self._server.stop()
+
+    # ------------------------------------------------------------------ drawing
+
+    def draw(self, drawings: Sequence[dr.Drawing]) -> None:
+        """Draw what has changed, all at once."""
+        with self._server.atomic():
+            for one in drawings:
+                self._draw(one)
+
+    def _draw(self, one: dr.Drawing) -> None:
+        scene = self._server.scene
+        match one:
+            case dr.Points():
+                scene.add_point_cloud(
+                    one.name,
+                    one.points,
+                    one.colour,
+                    point_size=_POINT_M,
+                    position=one.origin,
+                    point_shape="circle",
+                )
+            case dr.Lines():
+                scene.add_line_segments(
+                    one.name,
+                    one.segments,
+                    one.colour,
+                    thickness=one.width,
+                    thickness_units="screen",
+                    position=one.origin,
+                )
+            case dr.Body():
+                self._draw_body(one)
+            case dr.Picture():
+                self._draw_picture(one)
+            case dr.Text():
+                scene.add_label(one.name, one.text, position=one.position, font_screen_scale=1.3)
+            case dr.FloorGrid():
+                self._draw_floor(one)
+            case dr.Removed():
+                self._frames.pop(one.name, None)
+                self._colours.pop(one.name, None)
+                self._server.scene.remove_by_name(one.name)
+            case dr.Announcement():
+                for client in self._server.get_clients().values():
+                    client.add_notification(one.title, one.text, auto_close_seconds=6.0)
+
+    def _draw_body(self, body: dr.Body) -> None:
+        colour = body.colour if body.is_current else _GREY
+        if self._colours.get(body.name) != (colour, body.label):
+            self._make_body(body, colour)
+        upright, camera = self._frames[body.name]
+        upright.position, upright.wxyz = (
+            body.T_room_body[:3, 3],
+            _wxyz(_upright(body.T_room_body, body.T_body_cam0)),
+        )
+        camera.position, camera.wxyz = body.T_room_body[:3, 3], _wxyz(body.T_room_body[:3, :3])
+
+    def _make_body(self, body: dr.Body, colour: dr.Colour) -> None:
+        scene, name = self._server.scene, body.name
+        self._colours[name] = colour, body.label
+        scene.add_frame(name, show_axes=False)
+        upright = scene.add_frame(f"{name}/upright", show_axes=False)
+        camera = scene.add_frame(f"{name}/tilted", show_axes=False)
+        self._frames[name] = upright, camera
+        text = body.label if body.is_current else f"{body.label} (no current pose)"
+        scene.add_label(f"{name}/upright/label", text, position=(0.0, 0.0, 0.25), anchor="bottom-center")
+        if body.kind is AgentKind.ROBOT:
+            scene.add_cylinder(
+                f"{name}/upright/robot",
+                radius=_ROBOT_RADIUS_M,
+                height=_ROBOT_HEIGHT_M,
+                color=colour,
+                position=(0.0, 0.0, -_ROBOT_HEIGHT_M / 2),
+            )
+        horizontal, vertical = body.half_angles
+        scene.add_camera_frustum(
+            f"{name}/tilted/camera",
+            fov=float(2 * np.arctan(vertical)),
+            aspect=horizontal / vertical,
+            scale=_FRUSTUM_SIZE if body.kind is AgentKind.AR else 0.6 * _FRUSTUM_SIZE,
+            color=colour,
+            thickness=0.012,
+            position=body.T_body_cam0[:3, 3],
+            wxyz=_wxyz(body.T_body_cam0[:3, :3]),
+        )
+
+    def _draw_picture(self, picture: dr.Picture) -> None:
+        handle = self._server.scene.get_handle_by_name(f"{picture.name}/tilted/camera")
+        if handle is not None and (image := _small_picture(picture.jpeg)) is not None:
+            handle.image = image
+
+    def _draw_floor(self, floor: dr.FloorGrid) -> None:
+        self._floor = floor
+        (x0, y0), (x1, y1) = floor.low, floor.high
+        self._server.scene.add_grid(
+            "/floor",
+            width=x1 - x0,
+            height=y1 - y0,
+            cell_size=1.0,
+            section_size=5.0,
+            cell_color=(60, 60, 66),
+            section_color=(90, 90, 98),
+            position=((x0 + x1) / 2, (y0 + y1) / 2, floor.z),
+        )
+        for camera in list(self._cameras.values()):
+            camera.look_at_room(floor)
+
+    # ------------------------------------------------------------------ panel and cameras
+
+    def show_panel(self, html: str, agents: Sequence[str]) -> None:
+        """Show the side panel. agents: names that can be followed."""
+        if html != self._panel_html:
+            self._panel_html = self._panel.content = html
+        self._followed = tuple(agents)
+        for camera in list(self._cameras.values()):
+            camera.offer(self._followed)
+
+    def follow(self, place: Callable[[str], F64 | None]) -> None:
+        """Move the cameras that follow an agent. place: T_room_body (4, 4) of an agent by name."""
+        for camera in list(self._cameras.values()):
+            camera.follow(place)
+
+
+class _BrowserCamera:
+    """The camera of one browser, and how its user moves it."""
+
+    def __init__(self, client: Any, agents: tuple[str, ...]) -> None:
+        self._client = client
+        self._agents = agents
+        self._choice = client.gui.add_dropdown("camera", _choices(agents), initial_value=_ORBIT, order=-1.0)
+        self._choice.on_update(lambda _: self._choose())
+        self._floor: dr.FloorGrid | None = None
+        self._set_position: F64 | None = None  # that this program chose last
+        self._last: F64 | None = None  # of the agent that is followed
+
+    def offer(self, agents: tuple[str, ...]) -> None:
+        if agents != self._agents:
+            self._agents, chosen = agents, self._choice.value
+            self._choice.options = _choices(agents)
+            self._choice.value = chosen if chosen in _choices(agents) else _ORBIT
+
+    def look_at_room(self, floor: dr.FloorGrid | None) -> None:
+        """Show all of the room, unless its user has moved the camera."""
+        self._floor = floor
+        is_own = self._set_position is None or bool(
+            np.linalg.norm(self._client.camera.position - self._set_position) < 0.05
+        )
+        if is_own and self._choice.value == _ORBIT:
+            self._show_room()
+        elif self._choice.value == _ABOVE:
+            self._choose()
+
+    def _show_room(self) -> None:
+        if self._floor is None:
+            self._move(*_START)
+            return
+        centre, size = _extent(self._floor)
+        self._move(centre + _SEEN_SHARE * size * np.array([-0.45, -0.6, 0.55]), centre)
+
+    def _choose(self) -> None:
+        self._last = None
+        if self._choice.value == _ABOVE and self._floor is not None:
+            centre, size = _extent(self._floor)
+            self._move(centre + np.array([0.0, -0.01, _SEEN_SHARE * size]), centre)
+        elif self._choice.value == _ORBIT:
+            self._show_room()
+
+    def follow(self, place: Callable[[str], F64 | None]) -> None:
+        chosen = self._choice.value
+        if not chosen.startswith(_FOLLOW) or (T := place(chosen.removeprefix(_FOLLOW))) is None:
+            return
+        position, camera = T[:3, 3], self._client.camera
+        if self._last is None:
+            self._move(position + np.array([-1.5, -2.0, 1.8]), position)
+        elif np.linalg.norm(position - self._last) > 1e-3:
+            step = position - self._last
+            self._move(camera.position + step, camera.look_at + step)
+        self._last = position
+
+    def _move(self, position: F64, look_at: F64) -> None:
+        self._set_position = np.asarray(position)
+        with self._client.atomic():
+            self._client.camera.position, self._client.camera.look_at = position, look_at
+
+
+def _choices(agents: Sequence[str]) -> tuple[str, ...]:
+    return (_ORBIT, _ABOVE, *(f"{_FOLLOW}{name}" for name in agents))
+
+
+def _extent(floor: dr.FloorGrid) -> tuple[F64, float]:
+    """Return the centre (3,) and the diagonal of a room."""
+    low, high = np.array([*floor.low, floor.z]), np.array([*floor.high, floor.z])
+    return (low + high) / 2 + (0.0, 0.0, 0.8), float(np.linalg.norm(high - low))
+
+
+def _wxyz(R: F64) -> F64:
+    return np.asarray(np.roll(quat_from_matrix(R), 1))
+
+
+def _upright(T_room_body: F64, T_body_cam0: F64) -> F64:
+    """Return the rotation (3, 3) about the vertical by which x points where the camera looks."""
+    forward = (T_room_body @ T_body_cam0)[:2, 2]
+    length = float(np.hypot(*forward))
+    c, s = forward / length if length > 1e-6 else (1.0, 0.0)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _small_picture(jpeg: bytes) -> Any:
+    """Return a JPEG as a small image (h, w, 3) uint8; None if it cannot be decoded."""
+    try:
+        image = decode_gray(jpeg, "image")
+    except DataError:
+        return None
+    height = max(1, round(image.shape[0] * _PICTURE_PX / image.shape[1]))
+    small = cv2.resize(image, (_PICTURE_PX, height), interpolation=cv2.INTER_AREA)
+    return np.repeat(small[:, :, None], 3, axis=2)
+
+
+@contextmanager
+def _guarded_serving(
+    listener: socket.socket, guard: HttpGuard, browsers: Callable[[], int]
+) -> Iterator[None]:
+    """Make viser serve on this socket, and only requests that the guard lets through.
+
+    viser offers no such thing itself; it calls `websockets.asyncio.server.serve`, once."""
+    from websockets.asyncio import server
+
+    original = server.serve
+
+    def serve(handler: Any, _host: str, _port: int, **options: Any) -> Any:
+        respond = options.pop("process_request")
+
+        def check(connection: Any, request: Any) -> Any:
+            headers: dict[str, str] = {}
+            for name, value in request.headers.raw_items():
+                headers.setdefault(name.lower(), value)
+            refusal = guard.check(request.path, headers)
+            if refusal is not None:
+                response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
+            elif "upgrade" in headers and browsers() >= MAX_BROWSERS:
+                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers look on already\n"), ()
+            elif (response := respond(connection, request)) is not None:
+                lines = guard.cookie_headers()
+            for line in lines if response is not None else ():
+                name, _, value = line.partition(": ")
+                response.headers[name] = value
+            if response is not None:
+                response.headers["X-Frame-Options"] = "DENY"
+                response.headers["Referrer-Policy"] = "no-referrer"
+            return response
+
+        return original(
+            handler, sock=listener, process_request=check, **options | {"max_size": _MAX_MESSAGE_BYTES}
+        )
+
+    server.serve = serve
+    try:
+        yield
+    finally:
+        server.serve = original

@@ -1,0 +1,88 @@
+"""The side panel of the live room."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from share.types import AgentKind, TrackState
+from share.view import events as ev
+from share.view.panel import Panel, sparkline
+from share.view.room import LastCorrection, Room
+
+AGENT: dict[str, Any] = {
+    "run": "ann-1",
+    "kind": "ar",
+    "state": "OK",
+    "reason": "",
+    "gone": False,
+    "trouble": [],
+    "pose_ms": 6.3,
+    "qoe": 0.951,
+    "qoe_target": 0.93,
+    "rate_hz": 3.25,
+    "delay_ms": 14.2,
+    "map_id": "ann-1/0",
+    "keyframes": 12,
+}
+
+
+def panel_of(*events: ev.RoomEvent, now_s: float = 10.0) -> str:
+    room, panel = Room(), Panel()
+    for event in (ev.RunShown("ann-1", "ann", AgentKind.AR, np.eye(4), (0.8, 0.6)), *events):
+        panel.apply(event)
+        room.apply(event, 0.0)
+    room.corrections["ann-1"] = LastCorrection(6.0, 0.0123)
+    return panel.html(room, now_s)
+
+
+def words(html: str) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", html))
+
+
+def test_it_says_of_an_agent_what_decides() -> None:
+    text = words(panel_of(ev.AgentsReported({"ann": AGENT})))
+    for part in ("ann ar OK", "0.95 (target 0.93)", "12, at most 3.2 Hz", "14 ms", "6.3 ms, limit 20 ms"):
+        assert part in text.replace("  ", " ")
+    assert "12 mm, 4 s ago" in text and "ann-1/0" in text
+
+
+def test_trouble_and_decisions_are_said_with_their_reason() -> None:
+    late = AGENT | {"trouble": ["poses come 3.4 s, limit 20 ms"]}
+    text = words(
+        panel_of(
+            ev.AgentsReported({"ann": late}, ("the disk is full",), left_out=7),
+            ev.DecisionMade(1.0, "loop refused", "ann", "17 inliers of 25 needed"),
+            ev.DecisionMade(2.5, "maps merged", "ann", "B into A by 3 loops"),
+        )
+    )
+    for part in ("poses come 3.4 s, limit 20 ms", "the disk is full", "too slow for 7 updates"):
+        assert part in text
+    assert "maps merged: B into A by 3 loops" in text and "2.5 s maps merged: ann: B into A" in text
+    assert "17 inliers" not in text  # a newer decision replaced it
+
+
+def test_what_a_peer_says_is_text() -> None:
+    evil = "<img src=x onerror=alert(1)>"
+    html = panel_of(
+        ev.AgentsReported({evil: AGENT | {"state": evil, "map_id": evil, "trouble": [evil]}}, (evil,)),
+        ev.DecisionMade(1.0, "maps merged", evil, evil),
+    )
+    assert "<img" not in html and "&lt;img" in html
+
+
+def test_poses_are_a_line_below_or_above_the_limit() -> None:
+    poses = [ev.PoseShown("ann-1", TrackState.OK, 0, np.eye(4), ms) for ms in (5.0, 6.0, 90.0, 4000.0)]
+    html = panel_of(ev.AgentsReported({"ann": AGENT}), *poses)
+    heights = [float(y) for _, y in re.findall(r"([\d.]+),([\d.]+)", re.search(r'points="([^"]*)"', html)[1])]  # type: ignore[index]
+    limit = float(re.search(r'y1="([\d.]+)"', html)[1])  # type: ignore[index]
+    assert heights[0] > heights[1] > limit > heights[2] > heights[3] == 0.0
+    assert sparkline((), 20.0, "red") == ""
+
+
+def test_only_who_is_present_can_be_followed() -> None:
+    panel = Panel()
+    panel.apply(ev.AgentsReported({"ann": AGENT, "bob": AGENT | {"run": "bob-1", "gone": True}}))
+    assert panel.agents == {"ann-1": "ann"}

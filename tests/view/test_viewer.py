@@ -1,0 +1,209 @@
+"""The live room as a browser meets it: a process of its own, behind a guard. Needs viser."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import pickle
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from importlib.util import find_spec
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from share.errors import TransportError, UsageError
+from share.mapping.loops import KeyframeKey
+from share.types import AgentKind, TrackState
+from share.view import events as ev
+from share.view import viewer
+from share.view.viewer import LiveRoom
+
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
+TOKEN = "a-token-of-24-characters"
+
+
+def test_a_missing_viser_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"--view: the live room needs viser: pip install 'viser>=1.1,<2'"):
+        LiveRoom("0", None, "test")
+
+
+@pytest.fixture
+def room() -> Iterator[LiveRoom]:
+    with closing(LiveRoom("0", None, "test")) as out:
+        yield out
+
+
+def get(endpoint: str, path: str = "/", **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
+    connection = http.client.HTTPConnection(endpoint, timeout=30)
+    try:
+        connection.request("GET", path, headers={k.replace("_", "-"): v for k, v in headers.items()})
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def messages(data: bytes) -> list[dict[str, Any]]:
+    """What viser sends, without its arrays."""
+    import zstandard
+
+    size = int.from_bytes(data[8:16], "little")
+    inner = zstandard.ZstdDecompressor().decompress(
+        data[16 : 16 + size], max_output_size=int.from_bytes(data[:8], "little")
+    )
+    return list(msgspec.msgpack.decode(inner)["messages"])
+
+
+def browser(endpoint: str, **options: Any) -> Any:
+    import viser
+    from websockets.sync.client import connect
+
+    protocol: Any = [f"viser-v{viser.__version__}"]
+    return connect(f"ws://{endpoint}/", subprotocols=protocol, max_size=None, open_timeout=30, **options)
+
+
+def seen(connection: Any, name: str, within_s: float = 20.0) -> bool:
+    """Whether a thing of this name is drawn."""
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        try:
+            data = connection.recv(timeout=1.0)
+        except TimeoutError:
+            continue
+        if any(one.get("name") == name for one in messages(data)):
+            return True
+    return False
+
+
+def show_agent(room: LiveRoom) -> None:
+    points = np.random.default_rng(1).uniform(1, 3, (20, 3)).astype(np.float32)
+    key = KeyframeKey("ann-1", 0)
+    for event in (
+        ev.RunShown("ann-1", "ann", AgentKind.ROBOT, np.eye(4), (0.8, 0.6)),
+        ev.KeyframeShown(key, True, np.eye(4), points, b"no image"),
+        ev.CorrectionShown("ann-1", "A", np.eye(4), 0),
+        ev.PoseShown("ann-1", TrackState.OK, 0, np.eye(4), 5.0),
+        ev.DecisionMade(1.0, "maps merged", "ann", "<b>three loops</b>"),
+    ):
+        room.feed.add_event(event)
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_browser_sees_what_is_told_and_nobody_else_does(room: LiveRoom) -> None:
+    status, headers, page = get(room.endpoint)
+    assert status == 200 and b"<html" in page and headers["X-Frame-Options"] == "DENY"
+    assert get(room.endpoint, Host="evil.example")[0] == 403
+    assert get(room.endpoint, Origin="http://evil.example")[0] == 403
+    assert get(room.endpoint, "/../../../etc/passwd")[0] == 404
+    show_agent(room)
+    with browser(room.endpoint) as connection:
+        assert seen(connection, "/points/0/0")
+    with browser(room.endpoint) as later:  # who comes later sees all of it too
+        assert seen(later, "/agents/0/upright/robot")
+    from websockets.exceptions import InvalidStatus
+
+    with pytest.raises(InvalidStatus) as refused, browser(room.endpoint, origin="http://evil.example"):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+@needs_viser
+@pytest.mark.long
+def test_other_machines_need_the_token() -> None:
+    with pytest.raises(UsageError, match="--http-token"):
+        LiveRoom("0.0.0.0:0", None, "test")
+    with closing(LiveRoom("0.0.0.0:0", TOKEN, "test")) as room:
+        endpoint = room.endpoint.replace("0.0.0.0", "127.0.0.1")
+        assert get(endpoint)[0] == 401
+        status, headers, _ = get(endpoint, f"/?token={TOKEN}")
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert (status, headers["Location"]) == (303, "/")
+        assert get(endpoint, Cookie=cookie)[0] == 200
+        from websockets.exceptions import InvalidStatus
+
+        with pytest.raises(InvalidStatus), browser(endpoint):
+            pass
+        with browser(endpoint, additional_headers={"Cookie": cookie}) as connection:
+            show_agent(room)
+            assert seen(connection, "/points/0/0")
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_port_in_use_is_reported_before_a_process_starts(room: LiveRoom) -> None:
+    with pytest.raises(TransportError, match="the port is in use"):
+        LiveRoom(room.endpoint, None, "test")
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_killed_viewer_is_told_and_ends_nothing() -> None:
+    told: list[str] = []
+    with closing(LiveRoom("0", None, "test", told.append)) as room:
+        assert room.pid is not None
+        os.kill(room.pid, signal.SIGKILL)
+        deadline = time.monotonic() + 10
+        while not told and time.monotonic() < deadline:
+            show_agent(room)
+            time.sleep(0.05)
+    assert told == ["the live room has ended; the edge goes on"]
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_browser_cannot_have_a_tunnel_to_the_internet_opened() -> None:
+    """viser's page has a button for that, which is hidden; a program could press it all the same."""
+    from viser import ViserServer, _messages
+
+    from share.net.http_guard import HttpGuard, listen
+    from share.net.transport import Address
+    from share.view.window import Window
+
+    asked_for = {_messages.ShareUrlRequest, _messages.ShareUrlDisconnect}
+    listener, bound = listen(Address("127.0.0.1", 0))
+    plain, guarded = ViserServer("127.0.0.1", 0, verbose=False), Window(listener, HttpGuard(bound), "test")
+    try:
+        assert plain._websock_server._incoming_handlers.keys() >= asked_for
+        assert not guarded._server._websock_server._incoming_handlers.keys() & asked_for
+    finally:
+        plain.stop()
+        guarded.stop()
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_browser_that_stops_reading_holds_up_neither_room_nor_others(room: LiveRoom) -> None:
+    import socket
+
+    import viser
+
+    host, _, port = room.endpoint.rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=30) as stuck:
+        stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        stuck.sendall(
+            f"GET / HTTP/1.1\r\nHost: {room.endpoint}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+            f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n".encode()
+        )
+        show_agent(room)
+        points = np.random.default_rng(2).uniform(1, 3, (4000, 3)).astype(np.float32)
+        for k in range(1, 200):
+            key = KeyframeKey("ann-1", k)
+            room.feed.add_event(ev.KeyframeShown(key, False, np.eye(4), points))
+            time.sleep(0.01)
+        with browser(room.endpoint) as connection:
+            assert seen(connection, "/points/0/6")
+        assert room.feed.left_out == 0
+
+
+def test_events_are_plain_values_of_our_own() -> None:
+    """They go through a pipe between our own processes."""
+    event = ev.DecisionMade(1.0, "maps merged", None, "x")
+    assert pickle.loads(pickle.dumps(event)) == event
