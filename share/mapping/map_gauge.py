@@ -4,8 +4,8 @@ What is measured in a map is relative, so where it lies as a whole is a conventi
 keyframe, the whole map would move whenever the way from there to where the agents are becomes better known:
 all would see it move, though nothing changes between them. So the frame that is shown may lie off the one in
 which the map is solved: a solution is put where it moves those in it least, the surest odometry least of all
-(as the inner constraints of a free network do; Meissl, 1969). But no further off than the agents' places are
-uncertain: a drift that is known is corrected, for all alike.
+(as the inner constraints of a free network do; Meissl, 1969). But no further off than the place of the surest
+agent is uncertain: a drift that is known is corrected, for all alike.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class MapGauge:
 
 
 def _gauge(places: list[SolvedPlace], shown: list[F64]) -> F64:
-    """Return T_shown_map (4, 4) that moves these agents least from T_map_odom as shown before, as far as they
-    are uncertain."""
+    """Return T_shown_map (4, 4) that moves these agents least from T_map_odom as shown before, as far as the
+    place of the surest is uncertain."""
     solved_body = np.array([place.T_map_odom @ place.T_odom_body for place in places])
     shown_body = np.array([T @ place.T_odom_body for T, place in zip(shown, places, strict=True)])
     weights = 1 / np.array([place.step_variance for place in places])
@@ -67,7 +67,7 @@ def _gauge(places: list[SolvedPlace], shown: list[F64]) -> F64:
     about = se3.from_rt(np.eye(3), solved_body[:, :3, 3].mean(axis=0))
     way = se3.log(se3.inverse(about) @ T @ about)
     length_m = float(np.linalg.norm(way[3:]) + AHEAD_M * np.linalg.norm(way[:3]))
-    most_m = float(np.median([place.sigma_m for place in places]))
+    most_m = min(place.sigma_m for place in places)
     return about @ se3.exp(way * min(1.0, most_m / max(length_m, 1e-12))) @ se3.inverse(about)
 
 
