@@ -91,17 +91,25 @@ _MAX_COMPUTING = 64  # newest keyframes of a run that a correction may still ans
 
 class ComputationDelay:
     """tau_comp of one run: from a keyframe's arrival at the edge until the correction that answers it is
-    sent, filtered, ms; 0 before the first. Times by the edge's clock, ns."""
+    sent, filtered, ms; 0 before the first. held_ms: the same until its acknowledgement is sent, for which the
+    edge's disk may be waited for. Times by the edge's clock, ns."""
 
     def __init__(self) -> None:
-        self._filtered = FilteredDelay()
+        self._filtered, self._held = FilteredDelay(), FilteredDelay()
         self._received_ns: dict[int, int] = {}
+        self._unacknowledged_ns: dict[int, int] = {}
 
     def add_keyframe(self, keyframe: int, now_ns: int) -> None:
         """Add a keyframe that arrives now."""
-        self._received_ns[keyframe] = now_ns
-        if len(self._received_ns) > _MAX_COMPUTING:
-            del self._received_ns[next(iter(self._received_ns))]
+        for received_ns in (self._received_ns, self._unacknowledged_ns):
+            received_ns[keyframe] = now_ns
+            if len(received_ns) > _MAX_COMPUTING:
+                del received_ns[next(iter(received_ns))]
+
+    def acknowledge(self, next_keyframe: int, now_ns: int) -> None:
+        """Record that all keyframes below an id are acknowledged now."""
+        for keyframe in [keyframe for keyframe in self._unacknowledged_ns if keyframe < next_keyframe]:
+            self._held.add((now_ns - self._unacknowledged_ns.pop(keyframe)) / 1e6, now_ns)
 
     def answer(self, keyframe: int, now_ns: int) -> None:
         """Record that a correction answers a keyframe, the first that does."""
@@ -111,3 +119,7 @@ class ComputationDelay:
     @property
     def ms(self) -> float:
         return self._filtered.ms or 0.0
+
+    @property
+    def held_ms(self) -> float:
+        return self._held.ms or 0.0

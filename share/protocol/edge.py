@@ -169,7 +169,7 @@ class Edge:
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
         arrived = peer.counts["keyframes"], peer.counts["poses"]
-        report = AgentReport(peer.hello.kind, evaluation, self._now_ns, *arrived)
+        report = AgentReport(peer.hello.kind, evaluation, self._now_ns, *arrived, peer.computation.held_ms)
         t_s = self._event_log.elapsed_s(self._now_ns)
         self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
 
@@ -339,6 +339,7 @@ class Edge:
     def _acknowledge(self, *peers: Peer) -> None:
         """Acknowledge the durable keyframes of these peers."""
         for peer in peers:
+            peer.computation.acknowledge(peer.durable_below, self._now_ns)
             self._send(peer.id, peer.reorder_buffer.ack(peer.durable_below))
 
     def _on_finding(self, finding: MapEvent) -> None:

@@ -69,13 +69,14 @@ _FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 @dataclass(frozen=True)
 class AgentReport:
     """An evaluation as it arrives at the edge. now_ns: by the edge's clock. keyframes, poses: of this agent,
-    that have arrived so far."""
+    that have arrived so far. held_ms: how long the edge holds acknowledgements, for its disk."""
 
     kind: AgentKind
     evaluation: Evaluation
     now_ns: int
     keyframes: int = 0
     poses: int = 0
+    held_ms: float = 0.0
 
 
 class Policy:
@@ -187,7 +188,9 @@ class SharePolicy(Policy):
         told = report.evaluation
         hz = self.rate(agent, report.kind, told.delay_ms, told.error_cm, report.now_ns)
         terms = self._qoe_parameters(agent, report.kind)
-        return self._room.grant(agent, terms, hz, told, (report.keyframes, report.poses), report.now_ns)
+        air_ms = max(0.0, told.ack_ms - told.rtt_ms - report.held_ms)
+        counts = report.keyframes, report.poses
+        return self._room.grant(agent, terms, hz, told, air_ms, counts, report.now_ns)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int

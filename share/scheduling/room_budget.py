@@ -204,15 +204,17 @@ class Room:
         terms: QoeParameters,
         wanted_hz: float,
         evaluation: Evaluation,
+        air_ms: float,
         counts: tuple[int, int],
         now_ns: int,
     ) -> Grant:
-        """Return what an agent may send, by its evaluation. counts: its keyframes and poses so far."""
+        """Return what an agent may send, by its evaluation. air_ms: A. counts: its keyframes and poses so
+        far."""
         hz, pose_hz = self._rates(name, counts, now_ns)
         reported = AgentAir(
             terms=terms,
             wanted_hz=wanted_hz,
-            keyframe_s=max(0.0, evaluation.ack_ms - evaluation.rtt_ms) / 1e3,
+            keyframe_s=air_ms / 1e3,
             delay_ms=evaluation.delay_ms,
             error_cm=evaluation.error_cm,
             drift_cm=evaluation.drift_cm,

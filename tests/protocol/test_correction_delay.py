@@ -70,6 +70,15 @@ def test_the_edges_part_is_from_arrival_to_the_first_correction() -> None:
     assert part.ms == pytest.approx(30)
 
 
+def test_the_edge_holds_acknowledgements_for_its_disk() -> None:
+    part = ComputationDelay()
+    for k in range(4):
+        part.add_keyframe(k, 1000 * k * MS)
+        part.acknowledge(k, (1000 * k + 1) * MS)  # of the earlier ones again
+        part.acknowledge(k + 1, (1000 * k + 80) * MS)
+    assert part.held_ms == pytest.approx(80)
+
+
 def test_memory_is_bounded() -> None:
     delay, part = CorrectionDelay(), ComputationDelay()
     for k in range(5000):

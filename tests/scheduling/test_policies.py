@@ -225,6 +225,8 @@ def test_share_begins_with_the_least_rate_and_yields_where_keyframes_take_long()
     slow = Evaluation(0, 400.0, 1.0, track_ms=10.0, rtt_ms=10.0, ack_ms=310.0)
     quick = Evaluation(0, 45.0, 1.0, track_ms=10.0, rtt_ms=5.0, ack_ms=8.0)
     assert share.evaluate("ann", report(AgentKind.AR, 1.0, slow)) == least
+    disk = replace(report(AgentKind.AR, 1.0, slow), held_ms=299.0)  # the edge's disk, not the air
+    assert made("share", ControlConfig()).evaluate("ann", disk) != least
     for k in range(2, 12):
         grant = share.evaluate("ann", report(AgentKind.AR, float(k), quick, keyframes=9 + k))
     assert grant is not None and grant.pose_hz is None and grant.hz >= ControlConfig().rate_min_hz

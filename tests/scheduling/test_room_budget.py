@@ -63,14 +63,14 @@ class Air:
                 told = Evaluation(0, 60 + keyframe_ms, 1.2, 10.0, 5.0, 5 + keyframe_ms, 0.5)
                 counts = round(self.counts[k][0]), round(self.counts[k][1])
                 self.grants[k] = self.room.grant(
-                    f"a{k}", TERMS[kind], self.wanted_hz, told, counts, round(self.now_s * S)
+                    f"a{k}", TERMS[kind], self.wanted_hz, told, keyframe_ms, counts, round(self.now_s * S)
                 )
             self.history.append([g.hz for g in self.grants])
 
 
 def test_an_agent_whose_air_is_not_known_has_its_least_rate() -> None:
     told = Evaluation(0, 20.0, 1.0)
-    grants = [Room().grant("a0", TERMS[AR], 5.0, told, (n, 0), S) for n in range(3)]
+    grants = [Room().grant("a0", TERMS[AR], 5.0, told, 0.0, (n, 0), S) for n in range(3)]
     assert grants == [scarce_grant(AR), scarce_grant(AR), Grant(5.0)]
 
 
