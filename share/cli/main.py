@@ -16,7 +16,7 @@ from share import __version__  # noqa: E402
 from share.cli.commands import CommandGroup  # noqa: E402
 from share.cli.stderr import flush_all  # noqa: E402
 from share.cli.verbosity import verbosity  # noqa: E402
-from share.errors import ShareError, one_line  # noqa: E402
+from share.errors import ShareError, describe_exception, one_line  # noqa: E402
 from share.runtime.signals import unwind_on_signal  # noqa: E402
 
 
@@ -86,6 +86,10 @@ def main(arguments: list[str] | None = None) -> None:
         with contextlib.suppress(OSError):  # or Python flushes it again at exit, with a message of its own
             sys.stdout.close()
         _exit_with(f"{error.filename or 'cannot write the output'}: {error.strerror or error}", 1)
+    except Exception as error:  # a mistake of SHARE's; -v says where
+        verbosity.explain(error)
+        hint = "" if verbosity.is_on else "; repeat the command with -v, and report what it prints"
+        _exit_with(f"internal error: {describe_exception(error)}{hint}", 1)
 
 
 def _exit_with(text: str, code: int) -> None:

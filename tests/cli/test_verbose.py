@@ -54,6 +54,28 @@ def test_a_success_says_how_long_it_took(share, tmp_path):
     assert done.code == 0 and ": took " in done.err and "took" not in done.out
 
 
+def test_an_internal_error_is_one_line_and_with_v_a_traceback(share, tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("by zero\nor so")
+
+    monkeypatch.setattr("share.recordings.describe.describe_recording", fail)
+    walk = make_euroc(tmp_path / "walk")
+    done = share("dataset", "info", walk)
+    assert done.code == 1 and done.err.count("\n") == 1
+    assert (
+        "internal error: ZeroDivisionError: by zero?or so (test_verbose.py:" in done.err and "-v" in done.err
+    )
+    assert "Traceback" in share("dataset", "info", walk, "-v").err
+
+
+@pytest.mark.parametrize("out", [".", "/"])
+def test_a_folder_without_a_name_is_refused(out, share, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.chdir(tmp_path)
+    done = share("emulate", "--scene", "plain", "--motion", "walk:", "--seconds", 3, "--out", out)
+    assert done.code == 2 and done.err.count("\n") == 1 and "exists already" in done.err
+
+
 def test_more_commands_print_json(share, tmp_path):
     walk = make_euroc(tmp_path / "walk")
     done = share("dataset", "convert", walk, "--out", tmp_path / "w.mcap", "--json")

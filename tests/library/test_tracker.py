@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from helpers.recordings import make_euroc
 
 from share import Frame, ShareError, Tracker, load_calibration, open_recording
-from share.geometry.se3 import inverse, log
+from share.geometry.se3 import exp, inverse, log
 from share.recordings.trajectory import read_tum
 
 
@@ -41,6 +42,24 @@ def test_velocity_is_the_derivative_of_the_pose(tracked):
         assert np.allclose(pose.angular_velocity, turned, atol=0.15)
     speeds = [np.linalg.norm(pose.velocity) for pose in poses[15:]]
     assert max(speeds) > 0.3  # or the comparison says little
+
+
+@pytest.mark.long
+def test_velocity_without_an_imu_is_the_mean_since_the_last_frame(plain_session):
+    """The body is cam0, turned here, so that its axes are not the camera's."""
+    recording = open_recording(plain_session / "ar1")
+    mount = exp(np.array([0.3, -0.2, 0.5, 0.1, 0.0, -0.05]))
+    tracker = Tracker(replace(recording.rig.without_imu(), T_body_cam0=mount))
+    poses = [pose for frame in recording if (pose := tracker.track(frame))]
+    assert poses[0].velocity is None and len(poses) > 30
+    errors = []
+    for before, pose in pairwise(poses):
+        dt = (pose.stamp_ns - before.stamp_ns) * 1e-9
+        moved = log(inverse(before.T_odom_body) @ pose.T_odom_body) / dt
+        velocity = pose.T_odom_body[:3, :3].T @ pose.velocity
+        errors.append(np.abs(np.concatenate([pose.angular_velocity, velocity]) - moved).max())
+    assert np.median(errors) < 1e-6  # where a keyframe does not refine the pose after that
+    assert max(errors) < 0.1
 
 
 @pytest.mark.long

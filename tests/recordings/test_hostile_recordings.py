@@ -85,8 +85,9 @@ def test_unreadable_messages_are_skipped(tmp_path):
             if k == 100:
                 broken = (b"", b"\0\1\0\0", b"\xff" * 40, bytes(8) + b"\xff" * 300)
                 for number, data in enumerate(broken):
-                    for channel in recorder._channels.values():
-                        recorder._writer.add_message(channel, recorder._log_ns + number, data, 0, 0)
+                    writer = recorder._writer
+                    for channel in writer._channels.values():
+                        writer._writer.add_message(channel, recorder._log_ns + number, data, 0, 0)
     source = open_source(str(path))
     out = frames(source)
     assert [f.stamp_ns for f in out] == [10**9 + k * STEP_NS for k in range(100)]

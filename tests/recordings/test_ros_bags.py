@@ -186,3 +186,14 @@ def test_a_length_beyond_the_file_costs_no_memory(original, calib, tmp_path, soo
     bag.write_bytes(bytes(data))
     with pytest.raises(DataError, match="is not a ROS 1 bag, or damaged"):
         open_source(str(bag), calib)
+
+
+@pytest.mark.parametrize("form", ["split-mcap", "sqlite", "ros1"])
+def test_the_imu_of_a_bag_is_read_for_its_noise(form, original, tmp_path):
+    """As `share calibrate imu` does."""
+    from share.lab.calibrate.imu_table import read_imu
+
+    stamps, values = original.imu
+    table = read_imu(str(FORMS[form](tmp_path, messages(original))))
+    assert np.array_equal(table.imu.stamps_ns, stamps)
+    assert np.array_equal(np.hstack([table.imu.gyro, table.imu.accel]), values)

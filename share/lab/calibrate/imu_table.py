@@ -12,6 +12,7 @@ from share.errors import UsageError
 from share.files.yaml_file import read_yaml
 from share.geometry.camera import ImuNoise
 from share.recordings import tables
+from share.recordings.bags.message_file import is_message_file, open_messages
 from share.recordings.calibration import IMU_CHAIN, imu_noise
 from share.recordings.losses import DataLosses
 from share.recordings.session import is_session, read_session
@@ -19,8 +20,8 @@ from share.runtime.source import open_source
 from share.types import F64, I64, ImuBatch
 
 _SUPPORTED = (
-    "an .mcap recording, one of the RealSense SDK (.db3), SESSION/NAME, a folder with imu0/data.csv "
-    "(EuRoC/ASL), or such a data.csv: t[ns],wx,wy,wz,ax,ay,az"
+    "an .mcap recording, a ROS bag, one of the RealSense SDK (.db3), SESSION/NAME, a folder with "
+    "imu0/data.csv (EuRoC/ASL), or such a data.csv: t[ns],wx,wy,wz,ax,ay,az"
 )
 
 
@@ -41,12 +42,12 @@ def read_imu(source: str, on_progress: Callable[[int, int], None] = lambda done,
     Raises UsageError where it is no recording, DataError where it is damaged or has no IMU.
     """
     path = Path(source)
-    if path.suffix == ".mcap" and path.is_file():
-        return _read_mcap(path.stem, path, on_progress)
+    if path.exists() and is_message_file(path):
+        return _read_messages(path.stem, path, on_progress)
     if path.suffix == ".db3" and path.is_file():
         return _read_db3(path, on_progress)
     if is_session(path.parent) and not path.exists():
-        return _read_mcap(path.name, read_session(path.parent).recording(path.name), on_progress)
+        return _read_messages(path.name, read_session(path.parent).recording(path.name), on_progress)
     for csv in imu_csv_files(path):
         if csv.is_file():
             losses = DataLosses()
@@ -64,12 +65,11 @@ def imu_csv_files(path: Path) -> list[Path]:
     return [path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"]
 
 
-def _read_mcap(name: str, path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
-    from share.recordings.mcap.file import McapFile
+def _read_messages(name: str, path: Path, on_progress: Callable[[int, int], None]) -> ImuTable:
     from share.recordings.mcap.reader import read_imu as read
     from share.recordings.mcap.rig import own_serial
 
-    file, losses = McapFile(path), DataLosses()
+    file, losses = open_messages(path), DataLosses()
     stamps, values = read(file, on_progress, losses)
     return _clean_table(name, stamps, values, own_serial(file), sum(losses.counts.values()))
 
@@ -127,11 +127,10 @@ def stated_noise(source: str, chain_path: str | None, option: str) -> ImuNoise:
 
 def _source_noise(source: Path) -> ImuNoise | None:
     """Return the noise that the source states, None where it states none, as a recording of the IMU alone."""
-    if source.suffix == ".mcap" and source.is_file():
-        from share.recordings.mcap.file import McapFile  # imported only where needed
-        from share.recordings.mcap.rig import own_rig
+    if source.exists() and is_message_file(source):
+        from share.recordings.mcap.rig import own_rig  # imported only where needed
 
-        rig = own_rig(McapFile(source), {}, needed=False)
+        rig = own_rig(open_messages(source), {}, needed=False)
         return None if rig is None else rig.imu
     table = next((path for path in imu_csv_files(source) if path.is_file()), None)
     if table is None:

@@ -198,7 +198,8 @@ class PartialSession:
 
     def __init__(self, out: Path, digest: str) -> None:
         self.out = out
-        self._folder = out.with_name(f".{out.name}.partial")
+        place = Path(os.path.abspath(out))  # `.` has no name
+        self._folder = place.parent / f".{place.name}.partial"
         self.work, self.session = self._folder / digest, self._folder / "session"
 
     @property
