@@ -229,7 +229,8 @@ class _BrowserCamera:
     def _distance(self, size: float) -> float:
         """Return how far the camera is from a room of this diagonal; further in a narrow window."""
         camera = self._client.camera
-        return _SEEN_SHARE * size * min(2.0, max(1.0, camera.image_height / max(1, camera.image_width)))
+        narrowness = float(camera.image_height / max(1, camera.image_width))
+        return _SEEN_SHARE * size * min(2.0, max(1.0, narrowness))
 
     def _choose(self) -> None:
         self._last = None
