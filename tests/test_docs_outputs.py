@@ -17,6 +17,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from helpers.edge_in_process import Link, Thread
 from helpers.edge_sim import Person, Town, walls
 from helpers.hellos import hello_of
 from helpers.plain_walk import RIG
@@ -25,7 +26,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from share.cameras.live import LiveSource
 from share.config import Config, EdgeConfig
 from share.event_kinds import EventKind
-from share.net.transport import IncomingMessage
 from share.protocol.streaming import StreamingAgent
 from share.recordings.losses import DataLosses
 from share.runtime import edge, mapper_process
@@ -34,10 +34,8 @@ from share.runtime.edge_metrics import METRICS, render_metrics
 from share.runtime.frame_consumers import RemoteTracking
 from share.runtime.offline_tracking import track
 from share.runtime.status_server import StatusServer
-from share.runtime.worker_process import END, Inbox
 from share.types import TrackState
-from share.wire.codec import encode
-from share.wire.messages import Evaluation, PoseUpdate, Status, peer_id
+from share.wire.messages import Evaluation, PoseUpdate, Status
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES, STATUS = ((ROOT / "docs" / "lookup" / name).read_text() for name in ("files.md", "status.md"))
@@ -96,47 +94,6 @@ def test_events_are_those_that_the_code_writes() -> None:
 
 
 # ---------------------------------------------------------------- the edge
-
-
-class Thread:
-    """A `WorkerProcess` within this process."""
-
-    pid = None
-
-    def __init__(self, name: str, work: Any, arguments: tuple[Any, ...], on_answer: Any, *rest: Any) -> None:
-        self._inbox: Inbox = Inbox()
-        self._thread = threading.Thread(target=work, args=(self._inbox, on_answer, *arguments), name=name)
-        self._thread.start()
-        self.send = self._inbox.put
-
-    def close(self) -> None:
-        self._inbox.put(END)
-        self._thread.join(20)
-
-
-class Link:
-    """A link that agents have sent these messages over."""
-
-    endpoint = "nowhere"
-
-    def __init__(self, messages: Iterable[tuple[int, Any]]) -> None:
-        self._waiting = [IncomingMessage(peer_id(run), list(encode(message))) for run, message in messages]
-        self._waiting.append(IncomingMessage(peer_id(99), [b"of a stranger"]))
-
-    def receive(self, timeout_ms: int) -> IncomingMessage | None:
-        if self._waiting:
-            return self._waiting.pop(0)
-        time.sleep(min(timeout_ms, 1) / 1e3)
-        return None
-
-    def refusals(self) -> list[str]:
-        return []
-
-    def send(self, peer: bytes, frames: object) -> None: ...
-    def agent_names(self, key: str) -> None: ...
-    def trouble(self) -> None: ...
-    def wake(self) -> None: ...
-    def close(self) -> None: ...
 
 
 class Run:

@@ -78,7 +78,7 @@ def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) 
         out.append(f"{state}: {report['reason']}" if report["reason"] else state)
     for what, ms, limit_ms in (
         ("poses come", report["pose_ms"], limits.pose_ms),
-        ("corrections take", report["delay_ms"], limits.delay_ms),
+        ("its delay is", report["delay_ms"], limits.delay_ms),
     ):
         if ms is not None and ms > limit_ms:
             late = f"{ms / 1e3:.1f} s" if ms >= 1000 else f"{ms:.0f} ms"

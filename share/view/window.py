@@ -224,13 +224,19 @@ class _BrowserCamera:
             self._move(*_START)
             return
         centre, size = _extent(self._floor)
-        self._move(centre + _SEEN_SHARE * size * np.array([-0.45, -0.6, 0.55]), centre)
+        self._move(centre + self._distance(size) * np.array([-0.45, -0.6, 0.55]), centre)
+
+    def _distance(self, size: float) -> float:
+        """Return how far the camera is from a room of this diagonal; further in a narrow window."""
+        camera = self._client.camera
+        narrowness = float(camera.image_height / max(1, camera.image_width))
+        return _SEEN_SHARE * size * min(2.0, max(1.0, narrowness))
 
     def _choose(self) -> None:
         self._last = None
         if self._choice.value == _ABOVE and self._floor is not None:
             centre, size = _extent(self._floor)
-            self._move(centre + np.array([0.0, -0.01, _SEEN_SHARE * size]), centre)
+            self._move(centre + np.array([0.0, -0.01, self._distance(size)]), centre)
         elif self._choice.value == _ORBIT:
             self._show_room()
 
