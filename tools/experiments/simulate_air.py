@@ -88,6 +88,7 @@ class SampledSimulation(Simulation):
 
 
 def _waiting_ms(agent: Agent, now_ns: int) -> float:
+    """Return how long the oldest keyframe that is not acknowledged has been waiting."""
     return agent._self_evaluation.delay.waiting_ms(now_ns)
 
 
@@ -198,7 +199,8 @@ def _known(error_cm: float) -> float | None:
 
 def pooled(row: Row, kind: str, figure: str) -> np.ndarray[Any, Any]:
     """Return a figure of all agents of a kind in one run, joined."""
-    return np.concatenate([np.atleast_1d(a[figure]) for n, a in row["agents"].items() if n.startswith(kind)])
+    found = [np.atleast_1d(a[figure]) for name, a in row["agents"].items() if name.startswith(kind)]
+    return np.concatenate(found) if found else np.array([math.nan])
 
 
 def cells_of(rows: list[Row]) -> list[str]:
