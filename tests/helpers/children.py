@@ -67,5 +67,10 @@ def start_edge(folder: Path, bind: str = "tcp://127.0.0.1:0") -> tuple[Child, st
 
 
 def start_agent(folder: Path, name: str, source: Path, address: str, *more: str, kind: str = "ar") -> Child:
+    """Without a configuration in `more` it tracks every frame, also on a busy machine."""
     where = ("--edge", address, "--out", str(folder / name))
+    if "--config" not in more:
+        every_frame = folder / "every-frame.yaml"
+        every_frame.write_text("agent: {late_ms: 0}\n")
+        more = ("--config", str(every_frame), *more)
     return Child(folder / f"{name}.log", "agent", str(source), "--name", name, "--kind", kind, *where, *more)
