@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from share.geometry.camera import project, rays
+from share.geometry.camera import rays
 from share.odometry.initial_depth import current_rho
 from share.odometry.state import VELOCITY, FilterState
 from share.types import F64, I64
@@ -23,7 +23,7 @@ _MIN_AGE_NS = 250_000_000  # of the view compared with: 0.1 m/s at 5 m shows as 
 _MAX_SPEED_M_S = 0.02  # by the images
 _MIN_FEATURES = 12  # with fewer in view the images say nothing
 _NOISE_RAD = 1e-3  # of a displacement, beyond which a feature weighs less: 0.4 px
-_ITERATIONS = 3
+_ITERATIONS = 2
 _MAX_DARK_M_S, _MAX_DARK_SIGMA_M_S = 0.04, 0.03  # velocity and its sigma where they say nothing
 
 
@@ -64,18 +64,19 @@ def _image_speed(earlier: _View, view: _View, rho: F64) -> float:
     A robust fit of one displacement t: for small ones, d uv = rho (uv t_z - t_xy).
     """
     interval_ns = view.stamp_ns - earlier.stamp_ns
-    _, before, now = np.intersect1d(earlier.feature_ids, view.feature_ids, return_indices=True)
+    _, before, now = np.intersect1d(
+        earlier.feature_ids, view.feature_ids, assume_unique=True, return_indices=True
+    )
     if interval_ns < _MIN_AGE_NS or len(now) < _MIN_FEATURES:
         return np.inf
-    R_now_earlier = view.R_odom_cam.T @ earlier.R_odom_cam
-    uv = view.uv[now]
-    moved = uv - project(rays(earlier.uv[before]) @ R_now_earlier.T)[0]
+    uv, ray = view.uv[now], rays(earlier.uv[before]) @ earlier.R_odom_cam.T @ view.R_odom_cam
+    moved = uv - ray[:, :2] / ray[:, 2:]
     J = np.zeros((len(now), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = -rho[now]
     J[:, :, 2] = rho[now, None] * uv
     t = np.zeros(3)
     for _ in range(_ITERATIONS):
-        weight = 1 / (1 + (np.linalg.norm(moved - J @ t, axis=1) / _NOISE_RAD) ** 2)
+        weight = 1 / (1 + ((moved - J @ t) ** 2).sum(axis=1) / _NOISE_RAD**2)
         weighted = (weight[:, None, None] * J).reshape(-1, 3).T
         t = np.linalg.solve(weighted @ J.reshape(-1, 3), weighted @ moved.ravel())
     return float(np.linalg.norm(t)) / (interval_ns * 1e-9)
