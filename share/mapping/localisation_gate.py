@@ -19,12 +19,12 @@ from share.types import F64
 
 PATIENCE = 20  # keyframes with loops after which agents enter another map however uncertain
 _WIDENS_AFTER = 4  # keyframes with loops; with n times as many, n times the sigma is enough
-_AHEAD_M = 3.0  # what a wearer looks at
+AHEAD_M = 3.0  # what a wearer looks at
 
 
 def sigma_ahead(cov: F64) -> float:
     """Return the standard deviation (m) of what is 3 m from a body whose pose has the covariance (6, 6)."""
-    return float(np.hypot(se3.position_sigma(cov), _AHEAD_M * se3.rotation_sigma(cov)))
+    return float(np.hypot(se3.position_sigma(cov), AHEAD_M * se3.rotation_sigma(cov)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.geometry import se3
+from share.mapping.localisation_gate import AHEAD_M
 from share.types import F64
-
-AHEAD_M = 3.0  # what a wearer looks at: a turn counts by this lever
 
 
 @dataclass(frozen=True, eq=False)

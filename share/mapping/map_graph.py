@@ -1,7 +1,7 @@
 """The map graph: poses, edges, and which segments form one map.
 
 A map is a set of segments connected by loops. Its reference segment is the one of least rank, among equals
-the oldest; it gives the map its name, and its oldest keyframe stays where its odometry put it (the gauge).
+the oldest; it gives the map its name, and its oldest keyframe stays where its odometry put it.
 Maps follow from the loops alone, so removing a loop undoes its merge.
 """
 

@@ -153,6 +153,12 @@ class Peer(Sender):
     credential: str | None = ""
 
     @property
+    def map_id(self) -> str | None:
+        """Map of its newest correction."""
+        correction = None if self.last_finding is None else self.last_finding.correction
+        return None if correction is None else correction.map_id
+
+    @property
     def name(self) -> str:
         return self.hello.name
 

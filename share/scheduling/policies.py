@@ -69,7 +69,8 @@ _FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 @dataclass(frozen=True)
 class AgentReport:
     """An evaluation as it arrives at the edge. now_ns: by the edge's clock. keyframes, poses: of this agent,
-    that have arrived so far. held_ms: how long the edge holds acknowledgements, for its disk."""
+    that have arrived so far. held_ms: how long the edge holds acknowledgements, for its disk. is_placed: see
+    `share.scheduling.room_budget.AgentAir`."""
 
     kind: AgentKind
     evaluation: Evaluation
@@ -77,6 +78,7 @@ class AgentReport:
     keyframes: int = 0
     poses: int = 0
     held_ms: float = 0.0
+    is_placed: bool = True
 
 
 class Policy:
@@ -181,7 +183,7 @@ class SharePolicy(Policy):
         self._room = Room()
 
     def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
-        """Slow start: the least rate, until the room knows how the agent is served."""
+        """Slow start: the rate of joining, until the room knows how the agent is served."""
         return scarce_grant(self._qoe_parameters(agent, kind).form)
 
     def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
@@ -190,7 +192,7 @@ class SharePolicy(Policy):
         terms = self._qoe_parameters(agent, report.kind)
         air_ms = max(0.0, told.ack_ms - told.rtt_ms - report.held_ms)
         counts = report.keyframes, report.poses
-        return self._room.grant(agent, terms, hz, told, air_ms, counts, report.now_ns)
+        return self._room.grant(agent, terms, hz, told, air_ms, counts, report.now_ns, report.is_placed)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int

@@ -21,6 +21,7 @@ from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
+JOINING_HZ = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.5}  # of who shares a map with nobody yet
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 _POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
@@ -36,7 +37,7 @@ _SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 class AgentAir:
     """What the room knows of one agent. wanted_hz: rate by its own QoE. keyframe_s: A. delay_ms, error_cm:
     as in `qoe`. drift_cm: part of the error that grows between keyframes. hz: rate of its keyframes, poses
-    that it sends a second, both filtered."""
+    that it sends a second, both filtered. is_placed: it shares a map with somebody, or nobody is there."""
 
     terms: QoeParameters
     wanted_hz: float
@@ -47,10 +48,12 @@ class AgentAir:
     hz: float
     pose_hz: float
     updated_ns: int
+    is_placed: bool = True
 
     @property
     def least_hz(self) -> float:
-        return min(LEAST_HZ[self.terms.form], self.wanted_hz)
+        least = LEAST_HZ if self.is_placed else JOINING_HZ
+        return min(least[self.terms.form], self.wanted_hz)
 
 
 @dataclass(frozen=True)
@@ -106,8 +109,8 @@ class RoomBudget:
 
 
 def scarce_grant(form: AgentKind, hz: float | None = None) -> Grant:
-    """Return what an agent may send where the air is short, or not known yet. hz: its least rate if None."""
-    return Grant(LEAST_HZ[form] if hz is None else hz, SCARCE_POSE_HZ[form])
+    """Return what an agent may send where the air is short, or not known yet. hz: that of joining if None."""
+    return Grant(JOINING_HZ[form] if hz is None else hz, SCARCE_POSE_HZ[form])
 
 
 class _Prediction:
@@ -186,7 +189,7 @@ class _Prediction:
 
 
 _PERIOD_NS = 500_000_000  # between two allocations
-_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: it has its least rate
+_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: it has the rate of joining
 
 
 class Room:
@@ -207,9 +210,10 @@ class Room:
         air_ms: float,
         counts: tuple[int, int],
         now_ns: int,
+        is_placed: bool = True,
     ) -> Grant:
         """Return what an agent may send, by its evaluation. air_ms: A. counts: its keyframes and poses so
-        far."""
+        far. is_placed: see `AgentAir`."""
         hz, pose_hz = self._rates(name, counts, now_ns)
         reported = AgentAir(
             terms=terms,
@@ -221,6 +225,7 @@ class Room:
             hz=hz,
             pose_hz=pose_hz,
             updated_ns=now_ns,
+            is_placed=is_placed,
         )
         self._budget = self._budget.with_report(name, reported)
         if counts[0] < _SLOW_START_KEYFRAMES:

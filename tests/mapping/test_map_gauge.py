@@ -9,7 +9,8 @@ from helpers.atlas_sim import Walker, loop, near_loops, settle
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
-from share.mapping.map_gauge import AHEAD_M, MapGauge, SolvedPlace
+from share.mapping.localisation_gate import AHEAD_M
+from share.mapping.map_gauge import MapGauge, SolvedPlace
 from share.types import F64
 
 ANN, BOB, ROBOT = range(3)  # segments; the map is ann's

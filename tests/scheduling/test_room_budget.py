@@ -68,7 +68,7 @@ class Air:
             self.history.append([g.hz for g in self.grants])
 
 
-def test_an_agent_whose_air_is_not_known_has_its_least_rate() -> None:
+def test_an_agent_whose_air_is_not_known_has_the_rate_of_joining() -> None:
     told = Evaluation(0, 20.0, 1.0)
     grants = [Room().grant("a0", TERMS[AR], 5.0, told, 0.0, (n, 0), S) for n in range(3)]
     assert grants == [scarce_grant(AR), scarce_grant(AR), Grant(5.0)]
