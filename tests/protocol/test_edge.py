@@ -14,7 +14,7 @@ from helpers.hellos import hello_of
 from share.config import AgentQoe, Config, ControlConfig, EdgeConfig
 from share.geometry import se3
 from share.mapping import query_queue
-from share.mapping.corrections import MapEvent
+from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.query_queue import ENOUGH_VERIFIED
@@ -23,6 +23,7 @@ from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
+from share.scheduling.policies import POLICIES
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -207,6 +208,39 @@ def test_a_name_is_free_at_once_after_a_bye():
     tell(edge, 1, hello())
     tell(edge, 1, m.Bye(), 10)
     assert sent(tell(edge, 2, hello(run_id=2), 20), m.Welcome)
+
+
+def test_the_scheduler_knows_who_shares_a_map_with_somebody(monkeypatch):
+    placed = []
+
+    class Recorder(POLICIES["share"]):
+        def evaluate(self, agent, report):
+            placed.append(report.is_placed)
+
+    monkeypatch.setitem(POLICIES, "share", Recorder)
+    edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
+
+    def evaluate() -> bool:
+        tell(edge, 1, m.Evaluation(0, 50.0, 1.0))
+        return placed[-1]
+
+    def join(name: str, run_id: int) -> str:
+        return next(e.key for e in tell(edge, run_id, hello(name, run_id)) if isinstance(e, ed.AddRun))
+
+    def assign(run: str, map_id: str) -> None:
+        edge.handle(ed.MapperResult((map_assignment(run, map_id, np.eye(4), 0),), (), ()), 0)
+
+    ann = join("ann", 1)
+    assert evaluate()  # nobody else is there
+    bob = join("bob", 2)
+    assert not evaluate()
+    assign(ann, f"{ann}/0")
+    assign(bob, f"{bob}/0")
+    assert not evaluate()
+    assign(bob, f"{ann}/0")
+    assert evaluate()
+    tell(edge, 2, m.Bye())
+    assert evaluate()
 
 
 def test_max_agents_is_kept():
