@@ -24,6 +24,7 @@ _MAX_SPEED_M_S = 0.02  # by the images
 _MIN_FEATURES = 12  # with fewer in view the images say nothing
 _NOISE_RAD = 1e-3  # of a displacement, beyond which a feature weighs less: 0.4 px
 _ITERATIONS = 2
+_PRIOR = 1e-9  # keeps the fit solvable where all features are at infinity
 _MAX_DARK_M_S, _MAX_DARK_SIGMA_M_S = 0.04, 0.03  # velocity and its sigma where they say nothing
 
 
@@ -78,7 +79,8 @@ def _image_speed(earlier: _View, view: _View, rho: F64) -> float:
     for _ in range(_ITERATIONS):
         weight = 1 / (1 + ((moved - J @ t) ** 2).sum(axis=1) / _NOISE_RAD**2)
         weighted = (weight[:, None, None] * J).reshape(-1, 3).T
-        t = np.linalg.solve(weighted @ J.reshape(-1, 3), weighted @ moved.ravel())
+        normal = weighted @ J.reshape(-1, 3) + _PRIOR * np.eye(3)
+        t = np.linalg.solve(normal, weighted @ moved.ravel())
     return float(np.linalg.norm(t)) / (interval_ns * 1e-9)
 
 

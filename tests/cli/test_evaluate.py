@@ -162,7 +162,7 @@ def test_ablation_says_that_the_policy_of_the_settings_is_not_played(evaluate, p
     config.write_text("edge: {policy: streamed}")
     rest = ("--config", config, "--costs", "none", "--out", tmp_path / "r")
     first, *_ = evaluate("ablation", plain_session, *rest).err.splitlines()
-    names = "share, covins-g, linear, equal, random"
+    names = "share, share-paper, covins-g, linear, equal, random, fixed"
     assert first == f"share: {config}: edge.policy streamed is overridden by policies {names}"
     assert "edge.policy" not in evaluate("ablation", plain_session, "--policy", "streamed", *rest).err
 

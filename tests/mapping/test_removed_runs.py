@@ -134,7 +134,9 @@ def test_a_removed_run_that_returns_is_refused_with_the_remedy(tmp_path: Path) -
         assert "start the agent again" in refused.reason
         session.now_ns += 100 * S
         session.tell(999, hello_of("eve", 999))
-        assert isinstance(session.sent[-1], m.Welcome)
+        welcome, rate = session.sent[-2:]
+        assert isinstance(welcome, m.Welcome)
+        assert isinstance(rate, m.Rate)
 
 
 def test_a_run_that_returns_before_it_is_removed_continues(tmp_path: Path) -> None:
