@@ -146,6 +146,11 @@ class RunRegistry(Mapping[bytes, Peer]):
         """Return whether no other run of its name joined or came back later."""
         return next(reversed(self._runs_by_name[peer.name])) == peer.key
 
+    def shares_map(self, peer: Peer) -> bool:
+        """Return whether a run shares a map with another that is present, or no other is."""
+        others = [other for other in self.values() if other is not peer and not other.is_gone]
+        return not others or peer.map_id in {other.map_id for other in others} - {None}
+
     def latest_poses(self) -> dict[str, PoseUpdate]:
         """Return the newest pose of each present run, by run key."""
         present = (peer for peer in self.values() if not peer.is_gone)

@@ -16,7 +16,7 @@ from share.errors import UsageError, VersionError, WireError, printable
 from share.metrics.frame_log import summary
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
-from share.protocol.agent_status import StatusReporter
+from share.protocol.agent_status import StatusReporter, with_link
 from share.protocol.edge_clock import ClockEstimate, PingTracker
 from share.protocol.edge_sessions import EdgeSessions
 from share.protocol.keyframe_pace import KeyframePace
@@ -236,7 +236,8 @@ class Agent:
             case m.Pong():
                 self._on_pong(message)
             case _:
-                self._on_other_message(message)
+                name = type(message).__name__
+                self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
 
     def _on_ack(self, ack: m.Ack) -> None:
         if not self._ledger.acknowledge(ack):
@@ -244,10 +245,6 @@ class Agent:
             return
         acks_ms = self._self_evaluation.delay.acknowledge(ack.next_keyframe, self._now_ns)
         self._pace.acknowledge(acks_ms, self._now_ns)
-
-    def _on_other_message(self, message: m.Message) -> None:
-        name = type(message).__name__
-        self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
 
     def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
         """Decode a message. Print a line and return None for an edge of an older version. Raises
@@ -388,17 +385,8 @@ class Agent:
         if (report := self._status_reporter.due_report(self._now_ns)) is not None:
             self._effects.append(report)
             if self._is_connected:
-                self._send(self._with_link(report.status))
-
-    def _with_link(self, status: m.Status) -> m.Status:
-        """Return the status with the state of the link to the edge."""
-        waiting_ns = self._ledger.unacknowledged_for_ns(self._now_ns)
-        clock_error_ms = self.clock_estimate(self._now_ns).uncertainty_ms
-        return replace(
-            status,
-            unacknowledged_ms=min(waiting_ns / 1e6, m.MAX_POSE_AGE_MS),
-            clock_error_ms=None if clock_error_ms is None else min(clock_error_ms, m.MAX_POSE_AGE_MS),
-        )
+                waiting_ns = self._ledger.unacknowledged_for_ns(self._now_ns)
+                self._send(with_link(report.status, waiting_ns, self.clock_estimate(self._now_ns)))
 
     def _finish(self) -> None:
         if self._is_connected:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from share.errors import printable
 from share.protocol.agent_events import AgentTick, FrameTracked, StatusReport
-from share.protocol.edge_clock import PING_S, exponential_average
+from share.protocol.edge_clock import PING_S, ClockEstimate, exponential_average
 from share.timing import SECOND_NS, PeriodicTimer, seconds_to_ns
 from share.types import TrackState, WaitReason
 from share.wire.messages import MAX_POSE_AGE_MS, MAX_REASON_LENGTH, Status
@@ -125,3 +127,14 @@ class StatusReporter:
         if self._state is TrackState.INITIALISING:
             return "" if self._waiting_for is None else f"waiting for {self._waiting_for.text}"
         return _STATE_TEXTS.get(self._state, "").format((now_ns - self._since_ns) / SECOND_NS)
+
+
+def with_link(status: Status, waiting_ns: int, clock: ClockEstimate) -> Status:
+    """Return a status with the state of the link to the edge. waiting_ns: how long the oldest keyframe has
+    waited to be acknowledged."""
+    error_ms = clock.uncertainty_ms
+    return replace(
+        status,
+        unacknowledged_ms=min(waiting_ns / 1e6, MAX_POSE_AGE_MS),
+        clock_error_ms=None if error_ms is None else min(error_ms, MAX_POSE_AGE_MS),
+    )

@@ -169,15 +169,10 @@ class Edge:
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
         arrived = peer.counts["keyframes"], peer.counts["poses"]
-        service = peer.computation.held_ms, self._is_placed(peer)
+        service = peer.computation.held_ms, self._registry.shares_map(peer)
         report = AgentReport(peer.hello.kind, evaluation, self._now_ns, *arrived, *service)
         t_s = self._event_log.elapsed_s(self._now_ns)
         self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
-
-    def _is_placed(self, peer: Peer) -> bool:
-        """Return whether a run shares a map with another that is present, or no other is."""
-        others = [other for other in self._registry.values() if other is not peer and not other.is_gone]
-        return not others or peer.map_id in {other.map_id for other in others} - {None}
 
     def _send_grant(self, peer: Peer, grant: Grant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
