@@ -236,8 +236,7 @@ class Agent:
             case m.Pong():
                 self._on_pong(message)
             case _:
-                name = type(message).__name__
-                self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
+                self._on_other_message(message)
 
     def _on_ack(self, ack: m.Ack) -> None:
         if not self._ledger.acknowledge(ack):
@@ -245,6 +244,10 @@ class Agent:
             return
         acks_ms = self._self_evaluation.delay.acknowledge(ack.next_keyframe, self._now_ns)
         self._pace.acknowledge(acks_ms, self._now_ns)
+
+    def _on_other_message(self, message: m.Message) -> None:
+        name = type(message).__name__
+        self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
 
     def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
         """Decode a message. Print a line and return None for an edge of an older version. Raises
