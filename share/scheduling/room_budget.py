@@ -21,7 +21,7 @@ from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
-JOINING_HZ = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.5}  # of who shares a map with nobody yet
+JOINING_HZ = 1.0  # of who shares a map with nobody yet
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 _POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
@@ -52,8 +52,8 @@ class AgentAir:
 
     @property
     def least_hz(self) -> float:
-        least = LEAST_HZ if self.is_placed else JOINING_HZ
-        return min(least[self.terms.form], self.wanted_hz)
+        least_hz = LEAST_HZ[self.terms.form] if self.is_placed else JOINING_HZ
+        return min(least_hz, self.wanted_hz)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class RoomBudget:
 
 def scarce_grant(form: AgentKind, hz: float | None = None) -> Grant:
     """Return what an agent may send where the air is short, or not known yet. hz: that of joining if None."""
-    return Grant(JOINING_HZ[form] if hz is None else hz, SCARCE_POSE_HZ[form])
+    return Grant(JOINING_HZ if hz is None else hz, SCARCE_POSE_HZ[form])
 
 
 class _Prediction:
