@@ -183,8 +183,8 @@ class SharePolicy(Policy):
         self._room = Room()
 
     def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
-        """Slow start: the rate of joining, until the room knows how the agent is served."""
-        return scarce_grant(self._qoe_parameters(agent, kind).form)
+        """Return the highest rate: until the room knows the agent's air, its window holds it back."""
+        return scarce_grant(self._qoe_parameters(agent, kind).form, self._config.rate_max_hz)
 
     def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
         told = report.evaluation

@@ -108,9 +108,9 @@ class RoomBudget:
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
-def scarce_grant(form: AgentKind, hz: float | None = None) -> Grant:
-    """Return what an agent may send where the air is short, or not known yet. hz: that of joining if None."""
-    return Grant(JOINING_HZ if hz is None else hz, SCARCE_POSE_HZ[form])
+def scarce_grant(form: AgentKind, hz: float) -> Grant:
+    """Return what an agent may send where the air is short, or not known yet: few poses."""
+    return Grant(hz, SCARCE_POSE_HZ[form])
 
 
 class _Prediction:
@@ -189,7 +189,7 @@ class _Prediction:
 
 
 _PERIOD_NS = 500_000_000  # between two allocations
-_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: it has the rate of joining
+_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: its window alone holds it back
 
 
 class Room:
@@ -229,7 +229,7 @@ class Room:
         )
         self._budget = self._budget.with_report(name, reported)
         if counts[0] < _SLOW_START_KEYFRAMES:
-            return scarce_grant(terms.form)
+            return scarce_grant(terms.form, wanted_hz)
         if not self._budget.is_short:
             self._grants = {}
             return Grant(wanted_hz)
