@@ -22,7 +22,7 @@ import numpy as np
 from share.config import ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
-from share.scheduling.room_budget import Grant, Room, scarce_grant
+from share.scheduling.room_budget import Grant, Room, first_grant
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -183,8 +183,8 @@ class SharePolicy(Policy):
         self._room = Room()
 
     def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
-        """Return the highest rate: until the room knows the agent's air, its window holds it back."""
-        return scarce_grant(self._qoe_parameters(agent, kind).form, self._config.rate_max_hz)
+        """Slow start, until the room knows how the agent is served."""
+        return first_grant(self._qoe_parameters(agent, kind).form)
 
     def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
         told = report.evaluation

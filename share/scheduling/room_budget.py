@@ -22,6 +22,7 @@ from share.wire.messages import Evaluation
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
 JOINING_HZ = 1.0  # of who shares a map with nobody yet
+SLOW_START_HZ = 2.0  # of who sends its first keyframes
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 _POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
@@ -108,8 +109,13 @@ class RoomBudget:
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
+def first_grant(form: AgentKind) -> Grant:
+    """Return what an agent may send until its air is known."""
+    return scarce_grant(form, SLOW_START_HZ)
+
+
 def scarce_grant(form: AgentKind, hz: float) -> Grant:
-    """Return what an agent may send where the air is short, or not known yet: few poses."""
+    """Return what an agent may send where the air is short: few poses."""
     return Grant(hz, SCARCE_POSE_HZ[form])
 
 
@@ -189,7 +195,7 @@ class _Prediction:
 
 
 _PERIOD_NS = 500_000_000  # between two allocations
-_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known: its window alone holds it back
+_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 
 
 class Room:
@@ -229,7 +235,7 @@ class Room:
         )
         self._budget = self._budget.with_report(name, reported)
         if counts[0] < _SLOW_START_KEYFRAMES:
-            return scarce_grant(terms.form, wanted_hz)
+            return first_grant(terms.form)
         if not self._budget.is_short:
             self._grants = {}
             return Grant(wanted_hz)

@@ -17,7 +17,7 @@ from share.scheduling.room_budget import (
     Grant,
     Room,
     RoomBudget,
-    scarce_grant,
+    first_grant,
 )
 from share.types import AgentKind
 from share.wire.messages import Evaluation
@@ -44,7 +44,7 @@ class Air:
         self.alone_ms, self.kinds, self.wanted_hz = alone_ms, kinds, wanted_hz
         self.room, self.now_s = Room(), 0.0
         self.counts = [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
-        self.grants = [scarce_grant(kind, wanted_hz) for kind in kinds]
+        self.grants = [first_grant(kind) for kind in kinds]
         self.history: list[list[float]] = []
 
     def load(self) -> float:
@@ -68,10 +68,10 @@ class Air:
             self.history.append([g.hz for g in self.grants])
 
 
-def test_an_agent_whose_air_is_not_known_thins_its_poses() -> None:
+def test_an_agent_whose_air_is_not_known_starts_slowly() -> None:
     told = Evaluation(0, 20.0, 1.0)
     grants = [Room().grant("a0", TERMS[AR], 5.0, told, 0.0, (n, 0), S) for n in range(3)]
-    assert grants == [scarce_grant(AR, 5.0), scarce_grant(AR, 5.0), Grant(5.0)]
+    assert grants == [first_grant(AR), first_grant(AR), Grant(5.0)]
 
 
 def test_with_ample_air_everyone_gets_what_it_wants() -> None:
