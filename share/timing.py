@@ -51,11 +51,6 @@ class TokenBucket:
         self._refill(now_ns)
         self.hz = hz
 
-    def empty(self, now_ns: int) -> None:
-        """Drop what is saved."""
-        self._refill(now_ns)
-        self._tokens = 0.0
-
     def take(self, now_ns: int, preferred: bool = True, cost: float = 1.0) -> bool:
         """Take `cost` tokens. Return whether the item may pass now."""
         self._refill(now_ns)

@@ -46,7 +46,6 @@ class KeyframePace:
             self._window = None
         elif self._window is None:
             self._window = KeyframeWindow()
-            self._bucket.empty(now_ns)  # slow start: what waits for the edge already goes first
 
     def acknowledge(self, acks_ms: Sequence[float], now_ns: int) -> None:
         """Record how long acknowledgements took, ms."""

@@ -731,10 +731,9 @@ def test_edge_with_a_full_disk_continues(room, share, tmp_path):
 
 
 def test_agent_with_a_full_disk_continues(room, tmp_path):
-    """A limit on file size stands for the disk: 1 kB is full after a few poses, not by latency.csv."""
-    few = ("--frames", ":36")
+    """A limit on file size stands for the disk: 1 kB is full after a few poses."""
     with edge(tmp_path / "edge") as (server, address):
-        with start(*as_agent(room / "ar1", tmp_path / "out", address), *few, limit="ulimit -f 1") as agent:
+        with start(*as_agent(room / "ar1", tmp_path / "out", address), *FEW, limit="ulimit -f 1") as agent:
             done = end(agent, ask=False)
         assert end(server).code == 0
     assert done.code == 1
@@ -753,7 +752,7 @@ def test_agent_with_a_full_disk_continues(room, tmp_path):
     assert {len(line.split()) for line in lines} == {8}
     assert odom.read_text().endswith("\n")
     ann = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
-    assert ann["poses"] > 10
+    assert ann["poses"] > 3  # thinned until the air is known
 
 
 @pytest.mark.parametrize("more", [(), ("--profile", "d435i"), ("--profile", "laptop-edge")])

@@ -94,14 +94,15 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     child = edge(tmp_path)
     address = child.wait_for(r"listening on (tcp://\S+?),")[1]
     limits = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
-    (ann,) = crowd(("ann",), address, frames=120)
+    (ann,) = crowd(("ann",), address, frames=240)
     ann.start()
     child.wait_for("the map cannot be written")
     time.sleep(1.5)
-    assert ann.machine.report()["pending"] > 2
+    assert ann.machine.report()["pending"] > 0  # at most as many as its window allows
     assert "keyframes are not acknowledged" in child.said
     resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, limits)
     child.wait_for("the map is saved again")
+    time.sleep(2.0)  # its window lets it go on
     ann.finish()
     ann.join(20)
     assert ann.error is None
@@ -110,7 +111,7 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     with MapStore.open(tmp_path / "room.sqlite") as store:
         numbers = [k.keyframe_key.id for k in store.load().keyframes]
     assert numbers == list(range(ann.machine.report()["keyframes"]))
-    assert len(numbers) > 5
+    assert len(numbers) > 2
 
 
 @pytest.fixture
@@ -147,7 +148,7 @@ def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
     child.wait_for("the map cannot be written: No space left on device; keyframes are not acknowledged")
     time.sleep(2.0)
     acknowledged, waiting = (ann.machine.report()[name] for name in ("acknowledged", "pending"))
-    assert waiting > 3
+    assert waiting > 0  # at most as many as its window allows
     assert ann.machine.report()["acknowledged"] == acknowledged
     child.kill()
     assert kept_ids(small_disk / "room.sqlite", tmp_path / "full") == list(range(acknowledged))
