@@ -26,7 +26,7 @@ from share.protocol.peer import Peer, RestoredRun, Sender, fault_warnings
 from share.protocol.versions import refusal_of_version
 from share.scheduling.policies import AgentReport
 from share.scheduling.rate_scheduler import RateScheduler
-from share.scheduling.room_budget import Grant
+from share.scheduling.room_budget import RateGrant
 from share.timing import Throttle, seconds_to_ns
 from share.types import Keyframe
 from share.wire import messages as wire
@@ -174,7 +174,7 @@ class Edge:
         t_s = self._event_log.elapsed_s(self._now_ns)
         self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
 
-    def _send_grant(self, peer: Peer, grant: Grant | None) -> None:
+    def _send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
         if grant is not None and grant != peer.grant:
             self._send(peer.id, wire.Rate(grant.hz, self._rate_scheduler.is_windowed, grant.pose_hz))

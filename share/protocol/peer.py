@@ -16,7 +16,7 @@ from share.mapping.map_changes import StoredMap, map_poses
 from share.protocol.agent_health import PoseAges, agent_troubles
 from share.protocol.correction_delay import ComputationDelay
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
-from share.scheduling.room_budget import Grant
+from share.scheduling.room_budget import RateGrant
 from share.timing import SECOND_NS, seconds_to_ns
 from share.types import TrackState
 from share.wire.messages import Hello, PoseUpdate, Status, peer_id
@@ -148,7 +148,7 @@ class Peer(Sender):
     joined_ns: int | None = None  # first message in this session
     latest_pose: PoseUpdate | None = None
     pending_saves: int = 0
-    grant: Grant | None = None  # the last that was sent
+    grant: RateGrant | None = None  # the last that was sent
     computation: ComputationDelay = field(default_factory=ComputationDelay)
     credential: str | None = ""
 

@@ -22,7 +22,7 @@ import numpy as np
 from share.config import ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
-from share.scheduling.room_budget import Grant, Room, first_grant
+from share.scheduling.room_budget import RateGrant, RoomController, first_grant
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -99,15 +99,15 @@ class Policy:
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
 
-    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
         """Return what an agent that joins may send until its first evaluation; None: everything."""
         return None
 
-    def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
+    def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         """Return what the agent may send from now on; None: everything."""
-        told = report.evaluation
-        hz = self.rate(agent, report.kind, told.delay_ms, told.error_cm, report.now_ns)
-        return None if hz is None else Grant(hz)
+        evaluation = report.evaluation
+        hz = self.rate(agent, report.kind, evaluation.delay_ms, evaluation.error_cm, report.now_ns)
+        return None if hz is None else RateGrant(hz)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
@@ -130,8 +130,8 @@ class FixedPolicy(Policy):
 
     has_merge_gate = True
 
-    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
-        return Grant(self._hz)
+    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+        return RateGrant(self._hz)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
@@ -180,19 +180,19 @@ class SharePolicy(Policy):
         super().__init__(config)
         self._states: dict[str, PidState] = {}
         self._base_delays: dict[str, BaseDelay] = {}
-        self._room = Room()
+        self._room = RoomController()
 
-    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
         """Slow start, until the room knows how the agent is served."""
         return first_grant(self._qoe_parameters(agent, kind).form)
 
-    def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
-        told = report.evaluation
-        hz = self.rate(agent, report.kind, told.delay_ms, told.error_cm, report.now_ns)
+    def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
+        evaluation = report.evaluation
+        hz = self.rate(agent, report.kind, evaluation.delay_ms, evaluation.error_cm, report.now_ns)
         terms = self._qoe_parameters(agent, report.kind)
-        air_ms = max(0.0, told.ack_ms - told.rtt_ms - report.held_ms)
+        air_ms = max(0.0, evaluation.ack_ms - evaluation.rtt_ms - report.held_ms)
         counts = report.keyframes, report.poses
-        return self._room.grant(agent, terms, hz, told, air_ms, counts, report.now_ns, report.is_placed)
+        return self._room.grant(agent, terms, hz, evaluation, air_ms, counts, report.now_ns, report.is_placed)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
@@ -232,14 +232,15 @@ class SharePaperPolicy(SharePolicy):
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(replace(config, attribution=False))
 
-    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
         return None
 
-    def evaluate(self, agent: str, report: AgentReport) -> Grant | None:
-        told = report.evaluation
-        if told.keyframe < 0:
-            return Grant(self._states[agent].rate_hz) if agent in self._states else None
-        return Grant(self.rate(agent, report.kind, told.rtt_ms + told.track_ms, told.error_cm, report.now_ns))
+    def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
+        evaluation = report.evaluation
+        if evaluation.keyframe < 0:
+            return RateGrant(self._states[agent].rate_hz) if agent in self._states else None
+        delay_ms = evaluation.rtt_ms + evaluation.track_ms
+        return RateGrant(self.rate(agent, report.kind, delay_ms, evaluation.error_cm, report.now_ns))
 
 
 class EqualPolicy(SharePolicy):

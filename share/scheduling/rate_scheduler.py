@@ -7,7 +7,7 @@ from typing import NamedTuple
 from share.config import ControlConfig
 from share.scheduling.policies import POLICIES, AgentReport
 from share.scheduling.qoe import QoeParameters, qoe
-from share.scheduling.room_budget import Grant
+from share.scheduling.room_budget import RateGrant
 from share.timing import RingBuffer
 from share.types import AgentKind
 
@@ -51,11 +51,11 @@ class RateScheduler:
         self.begin_run(agent)
         self._history.pop(agent, None)
 
-    def first_grant(self, agent: str, kind: AgentKind) -> Grant | None:
+    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
         """Return what an agent that joins may send; None: everything."""
         return self._policy.first_grant(agent, kind)
 
-    def evaluate(self, agent: str, report: AgentReport, comp_ms: float, t_s: float) -> Grant | None:
+    def evaluate(self, agent: str, report: AgentReport, comp_ms: float, t_s: float) -> RateGrant | None:
         """Return what the agent may send from now on; None: everything. comp_ms: the edge's part of its
         delay. t_s: time for the report."""
         grant, evaluation = self._policy.evaluate(agent, report), report.evaluation

@@ -58,7 +58,7 @@ class AgentAir:
 
 
 @dataclass(frozen=True)
-class Grant:
+class RateGrant:
     """What an agent may send: keyframes and poses a second. pose_hz None: every pose."""
 
     hz: float
@@ -103,20 +103,20 @@ class RoomBudget:
         wanted = {name: agent.wanted_hz for name, agent in self.agents.items()}
         return _Prediction(self, is_thinned=False).is_noticed(wanted)
 
-    def allocate(self) -> dict[str, Grant]:
+    def allocate(self) -> dict[str, RateGrant]:
         """Return what every agent may send where the air is short."""
         rates = _Prediction(self, is_thinned=True).allocate()
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
-def first_grant(form: AgentKind) -> Grant:
+def first_grant(form: AgentKind) -> RateGrant:
     """Return what an agent may send until its air is known."""
     return scarce_grant(form, SLOW_START_HZ)
 
 
-def scarce_grant(form: AgentKind, hz: float) -> Grant:
+def scarce_grant(form: AgentKind, hz: float) -> RateGrant:
     """Return what an agent may send where the air is short: few poses."""
-    return Grant(hz, SCARCE_POSE_HZ[form])
+    return RateGrant(hz, SCARCE_POSE_HZ[form])
 
 
 class _Prediction:
@@ -198,13 +198,13 @@ _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 
 
-class Room:
+class RoomController:
     """The budget of one edge over time. Counts are of messages that have arrived so far."""
 
     def __init__(self) -> None:
         self._budget = RoomBudget()
         self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
-        self._grants: dict[str, Grant] = {}
+        self._grants: dict[str, RateGrant] = {}
         self._allocated_ns = 0
 
     def grant(
@@ -217,7 +217,7 @@ class Room:
         counts: tuple[int, int],
         now_ns: int,
         is_placed: bool = True,
-    ) -> Grant:
+    ) -> RateGrant:
         """Return what an agent may send, by its evaluation. air_ms: A. counts: its keyframes and poses so
         far. is_placed: see `AgentAir`."""
         hz, pose_hz = self._rates(name, counts, now_ns)
@@ -238,7 +238,7 @@ class Room:
             return first_grant(terms.form)
         if not self._budget.is_short:
             self._grants = {}
-            return Grant(wanted_hz)
+            return RateGrant(wanted_hz)
         if name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
             self._grants, self._allocated_ns = self._budget.allocate(), now_ns
         return self._grants[name]

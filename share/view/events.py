@@ -1,4 +1,4 @@
-"""What the live room is told: small frozen values, from the edge or from `share track`."""
+"""What the live room gets: small frozen values, from the edge or from `share track`."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class _AgentHistory:
     decision: str = ""
 
 
-class Panel:
+class SidePanel:
     """Collects what is said of agents. Times are the viewer's, s."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""What the live room is told of values of the edge, of a map file and of the tracker."""
+"""What the live room gets of values of the edge, of a map file and of the tracker."""
 
 from __future__ import annotations
 

@@ -107,11 +107,11 @@ class Viewer:
     """Applies events to a room and draws it."""
 
     def __init__(self, connection: Connection, window: Any) -> None:
-        from share.view.panel import Panel
+        from share.view.panel import SidePanel
         from share.view.room import Room
 
         self._connection, self._window = connection, window
-        self._room, self._panel = Room(), Panel()
+        self._room, self._panel = Room(), SidePanel()
         self._panel_due_s = 0.0
         self._is_ended = False
 

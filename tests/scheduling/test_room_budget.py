@@ -14,9 +14,9 @@ from share.scheduling.room_budget import (
     LEAST_HZ,
     SCARCE_POSE_HZ,
     AgentAir,
-    Grant,
-    Room,
+    RateGrant,
     RoomBudget,
+    RoomController,
     first_grant,
 )
 from share.types import AgentKind
@@ -42,7 +42,7 @@ class Air:
 
     def __init__(self, alone_ms: float, kinds: tuple[AgentKind, ...], wanted_hz: float = 1.5) -> None:
         self.alone_ms, self.kinds, self.wanted_hz = alone_ms, kinds, wanted_hz
-        self.room, self.now_s = Room(), 0.0
+        self.room, self.now_s = RoomController(), 0.0
         self.counts = [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
         self.grants = [first_grant(kind) for kind in kinds]
         self.history: list[list[float]] = []
@@ -70,14 +70,14 @@ class Air:
 
 def test_an_agent_whose_air_is_not_known_starts_slowly() -> None:
     told = Evaluation(0, 20.0, 1.0)
-    grants = [Room().grant("a0", TERMS[AR], 5.0, told, 0.0, (n, 0), S) for n in range(3)]
-    assert grants == [first_grant(AR), first_grant(AR), Grant(5.0)]
+    grants = [RoomController().grant("a0", TERMS[AR], 5.0, told, 0.0, (n, 0), S) for n in range(3)]
+    assert grants == [first_grant(AR), first_grant(AR), RateGrant(5.0)]
 
 
 def test_with_ample_air_everyone_gets_what_it_wants() -> None:
     air = Air(2.0, (AR, AR, ROBOT) * 4)
     air.play(20)
-    assert all(grant == Grant(1.5) for grant in air.grants)
+    assert all(grant == RateGrant(1.5) for grant in air.grants)
 
 
 def test_where_the_air_is_short_robots_yield_and_poses_are_thinned() -> None:
@@ -109,7 +109,7 @@ def test_after_the_air_clears_all_get_what_they_want_again() -> None:
     assert min(grant.hz for grant in air.grants) < 1.5
     air.alone_ms = 3.0
     air.play(15)
-    assert all(grant == Grant(1.5) for grant in air.grants)
+    assert all(grant == RateGrant(1.5) for grant in air.grants)
 
 
 def test_time_on_the_air_follows_from_what_is_measured_at_any_load() -> None:
@@ -134,7 +134,7 @@ def test_a_robot_delays_no_headset_unless_it_has_the_ar_form() -> None:
     bob = ControlConfig(agents={"bob": AgentQoe(form="ar")})
     urgent = replace(agent(ROBOT), terms=QoeParameters.from_config(bob, ROBOT, "bob"))
     granted = room(agent(AR), agent(ROBOT), urgent).allocate()
-    assert granted["a1"] == Grant(LEAST_HZ[ROBOT], SCARCE_POSE_HZ[ROBOT])
+    assert granted["a1"] == RateGrant(LEAST_HZ[ROBOT], SCARCE_POSE_HZ[ROBOT])
     assert granted["a2"] == granted["a0"]
     among_robots = room(agent(ROBOT), agent(ROBOT)).allocate()
     assert among_robots["a0"].hz > LEAST_HZ[ROBOT]

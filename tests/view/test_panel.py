@@ -9,7 +9,7 @@ import numpy as np
 
 from share.types import AgentKind, TrackState
 from share.view import events as ev
-from share.view.panel import Panel, sparkline
+from share.view.panel import SidePanel, sparkline
 from share.view.room import LastCorrection, Room
 
 AGENT: dict[str, Any] = {
@@ -30,7 +30,7 @@ AGENT: dict[str, Any] = {
 
 
 def panel_of(*events: ev.RoomEvent, now_s: float = 10.0) -> str:
-    room, panel = Room(), Panel()
+    room, panel = Room(), SidePanel()
     for event in (ev.RunShown("ann-1", "ann", AgentKind.AR, np.eye(4), (0.8, 0.6)), *events):
         panel.apply(event)
         room.apply(event, 0.0)
@@ -83,6 +83,6 @@ def test_poses_are_a_line_below_or_above_the_limit() -> None:
 
 
 def test_only_who_is_present_can_be_followed() -> None:
-    panel = Panel()
+    panel = SidePanel()
     panel.apply(ev.AgentsReported({"ann": AGENT, "bob": AGENT | {"run": "bob-1", "gone": True}}))
     assert panel.agents == {"ann-1": "ann"}

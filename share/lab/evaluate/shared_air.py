@@ -40,7 +40,7 @@ class AirModel:
 
 
 @dataclass(eq=False)
-class _Message:
+class _AirMessage:
     """A message on its way: packets that are left, and bytes of each. link: the agent from or to which."""
 
     link: str
@@ -53,7 +53,7 @@ class _Message:
 class _Station:
     """A station: its queue, remaining backoff in slots (-1: to be drawn), and contention window."""
 
-    queue: deque[_Message] = field(default_factory=deque)
+    queue: deque[_AirMessage] = field(default_factory=deque)
     backoff: int = -1
     window: int = _CW_MIN
 
@@ -80,7 +80,7 @@ class SharedAir:
         link: the agent that sends or gets it; a transmission carries messages of one link.
         """
         packets = max(1, math.ceil(size / PACKET_BYTES))
-        queued = _Message(link, packets, size / packets + HEADER_BYTES + _MAC_BYTES, deliver)
+        queued = _AirMessage(link, packets, size / packets + HEADER_BYTES + _MAC_BYTES, deliver)
         self._stations.setdefault(station, _Station()).queue.append(queued)
         if not self._is_busy:
             self._contend()
