@@ -43,7 +43,7 @@ from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
 from share.metrics.frame_log import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
 from share.protocol.agent_events import LocalisedPose  # noqa: E402
-from share.types import F64, KeyframeCandidate  # noqa: E402
+from share.types import F64, I64, KeyframeCandidate  # noqa: E402
 
 # others have agents that send raw frames
 SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]
@@ -86,15 +86,7 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
     of the edge's mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
     began = time.monotonic()
     who = list(made.agents.values())
-    first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
-    last_ns = max(agent.keyframes[-1].stamp_ns for agent in who)
-    rng = np.random.default_rng((seed, 9))
-    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]  # cameras are not in step
-    seen = [looks(agent, zero_ns, last_ns) for agent, zero_ns in zip(who, zeros_ns, strict=True)]
-    truth = {
-        a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
-        for a, zero_ns in zip(who, zeros_ns, strict=True)
-    }
+    seen, truth, seconds = frames_of_all(made, seed)
     mapper = None
     if modelled:
         known = truth_of(made, NEAR_M, config.control.far_m)
@@ -104,7 +96,7 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
     networks = [links.network_for(agent.hello.name) for agent in who]
     members = list(zip((a.hello for a in who), seen, networks, strict=True))
     world = Simulation(config, members, ProcessingDelays(), seed, mapper)
-    world.run((last_ns - first_ns) / 1e9 + 2.0)
+    world.run(seconds + 2.0)
     report = world.edge.report(world.mapper.report())
     agents = {}
     for agent in who:
@@ -149,6 +141,24 @@ def which(truth: dict[str, Trajectory]) -> Callable[[str, int], int]:
     """Return a function that gives the index of an agent's keyframe by its stamp."""
     at = {name: {ns: k for k, ns in enumerate(stamps_ns.tolist())} for name, (stamps_ns, _) in truth.items()}
     return lambda name, stamp_ns: at[name][stamp_ns]
+
+
+def frames_of_all(
+    made: KeyframeSet, seed: int
+) -> tuple[list[Iterator[TrackedFrame]], dict[str, tuple[I64, F64]], float]:
+    """Return each agent's frames, its keyframes' times (N,), ns, and true poses (N, 4, 4) by name, and the
+    duration, s. Cameras are not in step."""
+    who = list(made.agents.values())
+    first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
+    last_ns = max(agent.keyframes[-1].stamp_ns for agent in who)
+    rng = np.random.default_rng((seed, 9))
+    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]
+    seen = [looks(agent, zero_ns, last_ns) for agent, zero_ns in zip(who, zeros_ns, strict=True)]
+    truth = {
+        a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
+        for a, zero_ns in zip(who, zeros_ns, strict=True)
+    }
+    return seen, truth, (last_ns - first_ns) / 1e9
 
 
 def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[TrackedFrame]:

@@ -36,7 +36,7 @@ from keyframe_set import KeyframeSet  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from modelled_mapper import ModelledMapper, RecognitionModel  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
-from simulate import FRAME_NS, SIMULATED, looks, shared_errors, truth_of, which  # noqa: E402
+from simulate import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import NEAR_M, Config  # noqa: E402
@@ -136,15 +136,7 @@ def play(made: KeyframeSet, config: Config, air: str, seed: int, halved: str | N
     """Simulate one run."""
     began = time.monotonic()
     who = list(made.agents.values())
-    first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
-    last_ns = max(agent.keyframes[-1].stamp_ns for agent in who)
-    rng = np.random.default_rng((seed, 9))
-    zeros_ns = [first_ns - int(rng.integers(FRAME_NS)) for _ in who]  # cameras are not in step
-    seen = [looks(agent, zero_ns, last_ns) for agent, zero_ns in zip(who, zeros_ns, strict=True)]
-    truth = {
-        a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
-        for a, zero_ns in zip(who, zeros_ns, strict=True)
-    }
+    seen, truth, seconds = frames_of_all(made, seed)
     known = truth_of(made, NEAR_M, config.control.far_m)
     mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     network = load_network(air)
@@ -152,7 +144,6 @@ def play(made: KeyframeSet, config: Config, air: str, seed: int, halved: str | N
     world = SampledSimulation(config, members, ProcessingDelays(), seed, mapper)
     if halved is not None:
         _halve(world, *map(float, halved.split(":")))
-    seconds = (last_ns - first_ns) / 1e9
     world.run(seconds)
     return {
         "air": air,
