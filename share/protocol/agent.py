@@ -25,7 +25,8 @@ from share.protocol.versions import EdgeVersionProbe
 from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
 from share.types import F64, Correction, KeyframeCandidate
 from share.wire import messages as m
-from share.wire.codec import Bytes, decode, encode, message_bytes
+from share.wire.codec import decode, encode, message_bytes
+from share.wire.layouts import Bytes
 
 HELLO_S = 0.5  # interval of hellos, until welcomed
 REFUSED_S = 5.0  # a running agent that was refused asks again after this
