@@ -4,7 +4,9 @@ from share import startup
 
 startup.prepare_process()
 
+import hashlib  # noqa: E402
 import itertools  # noqa: E402
+import shutil  # noqa: E402
 import signal  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Callable, Iterator  # noqa: E402
@@ -22,6 +24,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+ROOT = Path(__file__).resolve().parents[1]
 _tests = itertools.count()
 
 
@@ -68,15 +71,29 @@ def shared_data() -> Path:
     return path
 
 
+def sources_digest() -> str:
+    """Of all that an emulated session is made by."""
+    digest = hashlib.sha256()
+    for path in sorted([*(ROOT / "share").rglob("*.py"), *(ROOT / "firmware_profiles").glob("*.yaml")]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
 @pytest.fixture(scope="session")
-def plain_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def plain_cache(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's cache folder ($XDG_CACHE_HOME) with the three seconds that `share demo --scene plain
     --seconds 3 --seed 18` plays: ar1, ar2 and robot in the plain room, 45 frames each. With this seed
-    each device has had 20 IMU samples by its first picture, all that the tracker needs to begin."""
+    each device has had 20 IMU samples by its first picture, all that the tracker needs to begin.
+
+    Made once for these sources: pytest keeps it in .pytest_cache, for all its workers and runs."""
     from share.lab.emulate.recipe import demo_recipe
     from share.lab.emulate.session import make_cached_session
 
-    cache = tmp_path_factory.mktemp("cache")
+    kept = getattr(request.config, "cache", None)  # none with -p no:cacheprovider
+    folder = tmp_path_factory.mktemp("cache") if kept is None else kept.mkdir("plain-session")
+    cache = Path(folder) / sources_digest()
+    for old in sorted(Path(folder).iterdir(), key=lambda one: one.stat().st_mtime)[:-2]:
+        shutil.rmtree(old, ignore_errors=True)
     make_cached_session(demo_recipe("plain", 3.0, 18), cache / "share")
     return cache
 
@@ -84,5 +101,5 @@ def plain_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def plain_session(plain_cache: Path) -> Path:
     """The session in there."""
-    (session,) = (plain_cache / "share").iterdir()
+    (session,) = (plain_cache / "share").glob("session-*")
     return session
