@@ -5,6 +5,7 @@
     checked_input   images and samples of a program's own camera
     agent           an agent in threads of this process; a program's own camera as its live camera
     edge            an edge in a thread and processes of this process
+    background      starting and stopping both
 
 docs/lookup/api.md lists the names; docs/do/integrate.md says how to use them.
 """

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
@@ -21,8 +20,9 @@ from share.cameras.feed import CameraFeed
 from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
 from share.cameras.sample_queue import NewestImageQueue
 from share.config import Config
-from share.errors import ShareError, UsageError
+from share.errors import UsageError
 from share.geometry.camera import Rig
+from share.library.background import BackgroundRun
 from share.library.checked_input import image_samples, imu_sample
 from share.library.recording import RecordedFrames, open_recording
 from share.net.keys import agent_keys
@@ -43,7 +43,7 @@ logger = logging.getLogger("share")
 MAX_WAITING_POSES = 1000  # for a program that reads them; beyond, the oldest are left out
 
 
-class AgentThread:
+class AgentThread(BackgroundRun):
     """One run of one agent. Use it as a context manager, or call `start` and `stop`.
 
     With a recording it plays at the recorded pace; with a rig it tracks the images and samples that
@@ -169,16 +169,6 @@ class AgentThread:
         self._waiting.put(None)  # for the next that asks
         if self._error is not None:
             raise self._error
-
-    def __enter__(self) -> AgentThread:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with contextlib.suppress(ShareError) if error is not None else contextlib.nullcontext():
-            self.stop()
 
     def _run_to_end(self) -> None:
         assert self._run is not None

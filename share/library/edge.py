@@ -8,11 +8,11 @@ import multiprocessing
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from share.config import POLICY_NAMES, STREAMED, Config, with_policy
-from share.errors import ShareError, UsageError
+from share.errors import UsageError
+from share.library.background import BackgroundRun
 from share.net.keys import edge_keys_for
 from share.net.transport import bind, parse_address
 from share.runtime.edge import EdgeRun
@@ -22,7 +22,7 @@ from share.wire.layouts import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 logger = logging.getLogger("share")
 
 
-class EdgeThread:
+class EdgeThread(BackgroundRun):
     """One run of an edge. Use it as a context manager, or call `start` and `stop`. endpoint: the address that
     agents connect to.
 
@@ -92,16 +92,6 @@ class EdgeThread:
         """Return the report (edge.json) as it is now, at most 0.1 s old; empty before the first. `trouble`:
         lines on what is wrong."""
         return self._run.report()
-
-    def __enter__(self) -> EdgeThread:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with contextlib.suppress(ShareError) if error is not None else contextlib.nullcontext():
-            self.stop()
 
     def _run_to_end(self) -> None:
         try:
