@@ -56,6 +56,7 @@ def count_tree() -> dict[str, int]:
     for name, tree in trees.items():
         for target in imported(tree, modules.keys()):
             importers[target].add(name)
+    single = [name for name, names in importers.items() if len(names) == 1]
     classes = Counter(
         node.name for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef)
     )
@@ -65,7 +66,8 @@ def count_tree() -> dict[str, int]:
         "laboratory: lines": sum(lines[name] for name in lab),
         "laboratory: modules": sum(bool(lines[name]) for name in lab),
         "modules over 400 lines": sum(n > 400 for n in lines.values()),
-        "modules with one importer": sum(len(names) == 1 for names in importers.values()),
+        "modules with one importer": len(single),
+        "... of fewer than 60 lines": sum(lines[name] < 60 for name in single),
         "class names used twice or more": sum(n > 1 for n in classes.values()),
         "configuration keys": configuration_keys(),
         "pages: kB": sum(path.stat().st_size for path in (ROOT / "docs").rglob("*.md")) // 1000,
