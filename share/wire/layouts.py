@@ -76,7 +76,7 @@ def _field_name(path: str) -> str:
 
 
 @dataclass(frozen=True)
-class Array:
+class ArrayField:
     """One array of a message, by its attribute path. None in the shape: any length up to `max_length`. An
     absent optional array has the shape (0,)."""
 
@@ -124,11 +124,13 @@ class Array:
         )
 
 
-class Layout:
-    """Layout of one message type. scalars: types by attribute path, checked both when encoding and when
+class MessageLayout:
+    """MessageLayout of one message type. scalars: types by attribute path, checked both when encoding and when
     decoding. build: makes the message of all its fields by name."""
 
-    def __init__(self, code: int, build: Callable[..., m.Message], *arrays: Array, **scalars: Any) -> None:
+    def __init__(
+        self, code: int, build: Callable[..., m.Message], *arrays: ArrayField, **scalars: Any
+    ) -> None:
         self.code, self.build, self.arrays = code, build, arrays
         self._names, self._getters = tuple(map(_field_name, scalars)), tuple(map(attrgetter, scalars))
         self._decoder = msgspec.msgpack.Decoder(tuple[tuple(scalars.values())])  # type: ignore[misc]
@@ -155,16 +157,16 @@ class Layout:
         }
 
 
-def _pose(path: str, optional: bool = False) -> Array:
-    return Array(path, "<f8", (4, 4), optional)
+def _pose(path: str, optional: bool = False) -> ArrayField:
+    return ArrayField(path, "<f8", (4, 4), optional)
 
 
-def _image(path: str, dtype: str = "|u1", optional: bool = False) -> Array:
-    return Array(path, dtype, (None, None), optional, m.MAX_IMAGE_SIDE)
+def _image(path: str, dtype: str = "|u1", optional: bool = False) -> ArrayField:
+    return ArrayField(path, dtype, (None, None), optional, m.MAX_IMAGE_SIDE)
 
 
-def _imu(path: str, dtype: str, *shape: int) -> Array:
-    return Array(path, dtype, (None, *shape), max_length=m.MAX_IMU_SAMPLES)
+def _imu(path: str, dtype: str, *shape: int) -> ArrayField:
+    return ArrayField(path, dtype, (None, *shape), max_length=m.MAX_IMU_SAMPLES)
 
 
 def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: bool, **rig: Any) -> m.Hello:
@@ -221,12 +223,12 @@ _RIG: dict[str, Any] = {  # sent as maps by field name, checked by their types
 }
 _KEYFRAME_ARRAYS = (
     _pose("T_ref_body"),
-    Array("cov", "<f8", (6, 6)),
+    ArrayField("cov", "<f8", (6, 6)),
     _pose("T_odom_body"),
-    Array("up", "<f8", (3,)),
-    Array("view.uv", "<f4", (None, 2)),
-    Array("view.points", "<f4", (None, 3)),
-    Array("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
+    ArrayField("up", "<f8", (3,)),
+    ArrayField("view.uv", "<f4", (None, 2)),
+    ArrayField("view.points", "<f4", (None, 3)),
+    ArrayField("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
 )
 _KEYFRAME_SCALARS: dict[str, Any] = {
     "id": Int64,
@@ -235,8 +237,8 @@ _KEYFRAME_SCALARS: dict[str, Any] = {
     "predecessor": Int64,
     "up_sigma": float,
 }
-LAYOUTS: dict[type, Layout] = {
-    m.Hello: Layout(
+LAYOUTS: dict[type, MessageLayout] = {
+    m.Hello: MessageLayout(
         1,
         _build_hello,
         _pose("rig.T_body_cam0"),
@@ -244,7 +246,7 @@ LAYOUTS: dict[type, Layout] = {
         _pose("rig.T_depth_cam0", optional=True),
         **{"name": Name, "kind": AgentKind, "run_id": Int64, "streams_frames": bool} | _RIG,
     ),
-    m.PoseUpdate: Layout(
+    m.PoseUpdate: MessageLayout(
         2,
         m.PoseUpdate,
         _pose("T_keyframe_body"),
@@ -253,20 +255,20 @@ LAYOUTS: dict[type, Layout] = {
         keyframe=Int64,
         age_ms=float,
     ),
-    Keyframe: Layout(
+    Keyframe: MessageLayout(
         3,
         _build_keyframe,
         *_KEYFRAME_ARRAYS,
-        Array("image.jpeg", "|u1", (None,), max_length=MAX_JPEG_BYTES),
-        Array("image.uv", "<f4", (None, 2), max_length=MAX_SURFACES, key="feature_uv"),
-        Array("image.plane", "<f4", (None, 3), max_length=MAX_SURFACES),
-        Array("image.rho_sigma", "<f4", (None,), max_length=MAX_SURFACES),
-        Array("earlier.ids", "<i8", (None,), max_length=MAX_SPANS),
-        Array("earlier.T_earlier_body", "<f4", (None, 4, 4), max_length=MAX_SPANS),
-        Array("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_SPANS, key="earlier_cov"),
+        ArrayField("image.jpeg", "|u1", (None,), max_length=MAX_JPEG_BYTES),
+        ArrayField("image.uv", "<f4", (None, 2), max_length=MAX_SURFACES, key="feature_uv"),
+        ArrayField("image.plane", "<f4", (None, 3), max_length=MAX_SURFACES),
+        ArrayField("image.rho_sigma", "<f4", (None,), max_length=MAX_SURFACES),
+        ArrayField("earlier.ids", "<i8", (None,), max_length=MAX_SPANS),
+        ArrayField("earlier.T_earlier_body", "<f4", (None, 4, 4), max_length=MAX_SPANS),
+        ArrayField("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_SPANS, key="earlier_cov"),
         **_KEYFRAME_SCALARS,
     ),
-    m.Evaluation: Layout(
+    m.Evaluation: MessageLayout(
         4,
         m.Evaluation,
         keyframe=Int64,
@@ -277,9 +279,9 @@ LAYOUTS: dict[type, Layout] = {
         ack_ms=float,
         drift_cm=float,
     ),
-    m.Ping: Layout(5, m.Ping, sequence=Int64, sent_ns=Int64),
-    m.Bye: Layout(6, m.Bye),
-    Frame: Layout(
+    m.Ping: MessageLayout(5, m.Ping, sequence=Int64, sent_ns=Int64),
+    m.Bye: MessageLayout(6, m.Bye),
+    Frame: MessageLayout(
         7,
         _build_frame,
         _image("image0"),
@@ -292,7 +294,7 @@ LAYOUTS: dict[type, Layout] = {
         index=Int64,
         gap_ns=Int64,
     ),
-    m.Status: Layout(
+    m.Status: MessageLayout(
         8,
         m.Status,
         state=TrackState,
@@ -301,24 +303,24 @@ LAYOUTS: dict[type, Layout] = {
         unacknowledged_ms=float,
         clock_error_ms=float | None,
     ),
-    m.Welcome: Layout(16, m.Welcome, session=Int64, next_keyframe=Int64),
-    m.Refused: Layout(17, m.Refused, reason=Text),
-    m.Ack: Layout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
-    Correction: Layout(
+    m.Welcome: MessageLayout(16, m.Welcome, session=Int64, next_keyframe=Int64),
+    m.Refused: MessageLayout(17, m.Refused, reason=Text),
+    m.Ack: MessageLayout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
+    Correction: MessageLayout(
         19,
         Correction,
         _pose("T_map_odom"),
-        Array("cov", "<f8", (6, 6)),
+        ArrayField("cov", "<f8", (6, 6)),
         map_id=MapId,
         revision=Int64,
         segment_keyframe=Int64,
         answered_keyframe=Int64,
     ),
-    m.Rate: Layout(20, m.Rate, hz=float, is_windowed=bool, pose_hz=float | None),
-    m.Pong: Layout(
+    m.Rate: MessageLayout(20, m.Rate, hz=float, is_windowed=bool, pose_hz=float | None),
+    m.Pong: MessageLayout(
         21, m.Pong, sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64
     ),
-    m.RemoteTrackingResult: Layout(
+    m.RemoteTrackingResult: MessageLayout(
         22,
         m.RemoteTrackingResult,
         _pose("T_odom_body", optional=True),
@@ -333,4 +335,6 @@ LAYOUTS: dict[type, Layout] = {
 }
 MESSAGE_CODES = {message_type: layout.code for message_type, layout in LAYOUTS.items()}
 LAYOUT_BY_CODE = {layout.code: (cls.__name__, layout) for cls, layout in LAYOUTS.items()}
-KEYFRAME_WITHOUT_IMAGE = Layout(3, _build_keyframe_without_image, *_KEYFRAME_ARRAYS, **_KEYFRAME_SCALARS)
+KEYFRAME_WITHOUT_IMAGE = MessageLayout(
+    3, _build_keyframe_without_image, *_KEYFRAME_ARRAYS, **_KEYFRAME_SCALARS
+)
