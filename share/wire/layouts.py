@@ -125,7 +125,7 @@ class ArrayField:
 
 
 class MessageLayout:
-    """MessageLayout of one message type. scalars: types by attribute path, checked both when encoding and when
+    """Layout of one message type. scalars: types by attribute path, checked both when encoding and when
     decoding. build: makes the message of all its fields by name."""
 
     def __init__(
