@@ -81,6 +81,11 @@ class LoopAcceptance:
         self._rejected_at: dict[Loop, F64] = {}  # pending loops that did not fit, and T_a_b of the map then
         self._config, self._graph, self._overlap_check = config, graph, overlap_check
 
+    @property
+    def comparison_count(self) -> int:
+        """Pairs of views compared since the start."""
+        return self._overlap_check.comparison_count
+
     def decide(self, loop: Loop) -> LoopDecision:
         """Accept a loop, keep it pending, or reject it. Raises ValueError if a keyframe is unknown."""
         a, b = self._graph.loop_nodes(loop)
