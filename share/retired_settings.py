@@ -130,8 +130,8 @@ RETIRED_SETTINGS: dict[str, str] = {
     "agent.blend_jump_m": "protocol.localisation.JUMP_M",
     "agent.blend_jump_rad": "protocol.localisation.JUMP_M",  # a rotation counts by its lever
     # link
-    "link.hello_s": "protocol.agent.HELLO_S",
-    "link.refused_s": "protocol.agent.REFUSED_S",
+    "link.hello_s": "protocol.edge_connection.HELLO_S",
+    "link.refused_s": "protocol.edge_connection.REFUSED_S",
     "link.ping_s": "protocol.edge_clock.PING_S",
     "link.resend_s": "protocol.agent_ledger.RESEND_S",
     "link.resend_max_s": "protocol.agent_ledger.RESEND_MAX_S",

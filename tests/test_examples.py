@@ -66,10 +66,14 @@ def test_read_poses(share, plain_session, tmp_path):
     config.write_text("agent: {finish_s: 0.1}\n")
     options = ("--kind", "ar", "--edge", "tcp://127.0.0.1:1", "--config", config)
     share("agent", plain_session / "ar1", "--name", "ann", *options, "--poses", f"udp://127.0.0.1:{port}")
-    out, err = reader.communicate(timeout=30)
-    assert err == ""
-    posed = [line for line in out.splitlines() if line.startswith("ann OK odom")]
-    assert len(posed) >= 30 and posed[-1].endswith("m/s")
+    posed: list[str] = []
+    for line in reader.stdout:  # ends 10 s after the last message
+        posed += [line.rstrip()] * line.startswith("ann OK odom")
+        if len(posed) == 30:
+            break
+    reader.terminate()
+    assert reader.communicate(timeout=30)[1] == ""
+    assert len(posed) == 30 and posed[-1].endswith("m/s")
 
 
 @pytest.mark.parametrize("frame", FRAMES)

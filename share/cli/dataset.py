@@ -37,7 +37,7 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
               share dataset info session/ann --json
               share dataset info room.sqlite
     """
-    from share.recordings.bags.message_file import is_message_file, open_messages
+    from share.recordings.bags.opening import is_message_file, open_messages
     from share.recordings.describe import describe_messages, describe_recording
     from share.runtime.source import open_source
     from share.store.export import describe_map

@@ -42,9 +42,8 @@ def export_map_tables(source: str, out: Path, as_json: bool) -> None:
 
 def open_scenes(source: str, calib: str | None, frames: slice | None) -> list[Scene]:
     """Return what a map, a run or a recording holds; the latter is tracked. Raises UsageError, ShareError."""
-    from share.runtime.scenes import is_run, recording_scene, run_scene
+    from share.runtime.scenes import is_run, map_scenes, recording_scene, run_scene
     from share.runtime.source import open_source
-    from share.store.map_scene import map_scenes
     from share.store.map_store import is_map
 
     path = Path(source)

@@ -83,7 +83,7 @@ def edge(
     from share.runtime.signals import stop_on_signal
     from share.runtime.status_server import StatusServer
     from share.view.viewer import LiveRoom
-    from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
+    from share.wire.layouts import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     edge_key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
     is_streamed = settings.edge.policy == STREAMED

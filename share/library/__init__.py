@@ -3,8 +3,7 @@
     recording       a recording as frames; calibrations
     tracker         frames, or images and IMU samples one by one, to poses
     checked_input   images and samples of a program's own camera
-    own_camera      the same for an agent, as a live camera
-    agent           an agent in threads of this process
+    agent           an agent in threads of this process; a program's own camera as its live camera
     edge            an edge in a thread and processes of this process
 
 docs/lookup/api.md lists the names; docs/do/integrate.md says how to use them.

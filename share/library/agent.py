@@ -1,4 +1,5 @@
-"""An agent in threads of this process, as `share agent` runs it in a process of its own."""
+"""An agent in threads of this process, as `share agent` runs it in a process of its own; with a recording, or
+with the program's own camera, whose samples are pushed and whose newest images are tracked."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ import logging
 import queue
 import secrets
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -15,10 +17,13 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
+from share.cameras.feed import CameraFeed
+from share.cameras.live import MAX_WAITING_FRAMES, LiveSource
+from share.cameras.sample_queue import NewestImageQueue
 from share.config import Config
 from share.errors import ShareError, UsageError
 from share.geometry.camera import Rig
-from share.library.own_camera import OwnCamera, OwnCameraSource
+from share.library.checked_input import image_samples, imu_sample
 from share.library.recording import RecordedFrames, open_recording
 from share.net.keys import agent_keys
 from share.net.transport import check_keys, connect, parse_address
@@ -28,6 +33,8 @@ from share.runtime.error_estimators import model_estimator
 from share.runtime.pipeline import check_trackable
 from share.runtime.pose import Pose
 from share.runtime.pose_feed import open_pose_sinks
+from share.sensors.measurement import CAM0
+from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample
 from share.types import AgentKind, TrackState
 from share.wire.messages import Hello
 
@@ -208,3 +215,58 @@ class _AgentPoses:
 
     def close(self) -> None:
         """The owner's run closes what else is open."""
+
+
+class OwnCamera:
+    """A `share.cameras.feed.CameraDevice` whose samples a program pushes, from any one thread."""
+
+    def __init__(self, rig: Rig, rate_hz: float) -> None:
+        """rate_hz: of cam0's images."""
+        self.rig, self.serial = rig, "own camera"
+        rates = dict.fromkeys(rig.cameras, rate_hz)
+        self.rates_hz: Mapping[str, float] = (
+            rates if rig.imu is None else rates | dict.fromkeys((ACCEL, GYRO), rig.imu.rate_hz)
+        )
+        self._sink: Callable[[DeviceSample], None] | None = None
+
+    def start(self, sink: Callable[[DeviceSample], None]) -> None:
+        self._sink = sink
+
+    def stop(self) -> None:
+        self._sink = None
+
+    def reset(self) -> None:
+        """The program that pushes samples has nothing to reset."""
+
+    def feed_imu(self, stamp_ns: int, gyro: ArrayLike, accel: ArrayLike) -> None:
+        """As `Tracker.feed_imu`. Raises UsageError."""
+        if self.rig.imu is None:
+            raise UsageError("gyro: the rig has no IMU; load a calibration with Kalibr's IMU chain")
+        sample = imu_sample(stamp_ns, gyro, accel)
+        for stream, values in ((ACCEL, sample.payload[3:]), (GYRO, sample.payload[:3])):
+            self._push(stream, sample.stamp_ns, values)
+
+    def feed_images(
+        self,
+        stamp_ns: int,
+        image0: NDArray[Any],
+        image1: NDArray[Any] | None = None,
+        depth: NDArray[Any] | None = None,
+    ) -> None:
+        """As `Tracker.feed_images`. Raises UsageError."""
+        for sample in image_samples(self.rig, stamp_ns, image0, image1, depth):
+            self._push(sample.stream, sample.stamp_ns, sample.payload)
+
+    def _push(self, stream: str, stamp_ns: int, payload: Any) -> None:
+        if (sink := self._sink) is not None:  # else nobody listens: before the start, after the end
+            sink(DeviceSample(stream, stamp_ns, payload, time.monotonic_ns()))
+
+
+class OwnCameraSource(LiveSource):
+    """An `OwnCamera` as a SOURCE."""
+
+    def __init__(self, camera: OwnCamera, notify: Callable[[str], None]) -> None:
+        queue = NewestImageQueue(MAX_WAITING_FRAMES * len(camera.rig.cameras))
+        feed = CameraFeed(lambda serial, attempts: camera, None, camera.rates_hz, notify, queue)
+        super().__init__(feed, camera.rates_hz[CAM0])
+        self.name, self.serial = camera.serial, None

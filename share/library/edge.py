@@ -17,7 +17,7 @@ from share.net.keys import edge_keys_for
 from share.net.transport import bind, parse_address
 from share.runtime.edge import EdgeRun
 from share.store.map_store import MapStore
-from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
+from share.wire.layouts import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
 logger = logging.getLogger("share")
 

@@ -18,7 +18,7 @@ from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.runtime.pipeline import check_trackable
 from share.runtime.pose import Pose, tracked_pose
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import FrameSequencer, SequencerCounters, rig_streams
+from share.sensors.sequencer import FrameMerger, FrameSequencer, SequencerCounters, rig_streams
 from share.types import Frame, TrackState, WaitReason
 
 logger = logging.getLogger("share")
@@ -44,7 +44,7 @@ class Tracker:
         self.waiting_for: WaitReason | None = None
         self._tracker = GuardedTracker(rig, settings, FaultGuard(logger.warning))
         self._sequencer = FrameSequencer(
-            rig_streams(rig), rate_hz, settings.sequencer, SequencerCounters(), rig.timeshift_ns
+            FrameMerger(rig_streams(rig), rate_hz, settings.sequencer, SequencerCounters(), rig.timeshift_ns)
         )
         self._segment, self._newest_ns = 0, -1
         self._unfinished: tuple[Frame, bool] | None = None  # the last frame; whether it becomes a keyframe

@@ -17,7 +17,7 @@ from typing import Protocol
 
 from share.errors import TransportError, UsageError
 from share.net.keys import AgentKeys, EdgeKeys
-from share.wire.codec import MAX_FRAME_BYTES, Bytes
+from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 
 QUEUE_MESSAGES = 128  # per queue and direction; poses at 30 Hz fill it in 4 s
 LINGER_MS = 200  # how long `close` waits for the last messages to leave

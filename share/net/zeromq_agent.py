@@ -20,7 +20,7 @@ from share.net.keys import AgentKeys
 from share.net.transport import LINGER_MS, check_keys, parse_address
 from share.net.zeromq_socket import ZmqSocket
 from share.timing import Backoff
-from share.wire.codec import MAX_FRAME_BYTES, Bytes
+from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 from share.wire.messages import peer_id
 
 _BACKLOG_CHECK_MS = 20  # how often the data that wait are checked

@@ -17,7 +17,7 @@ from share.net.connection_guard import ConnectionGuard
 from share.net.keys import EdgeKeys
 from share.net.transport import LINGER_MS, Address, IncomingMessage, bind_error, check_keys, parse_address
 from share.net.zeromq_socket import MAX_PARTS, WAKE, ZmqSocket
-from share.wire.codec import MAX_FRAME_BYTES, Bytes
+from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 from share.wire.messages import PEER_ID_BYTES
 
 _GUARD_WAKE = b"g"  # wakes the socket for the guard: look for a message, but do not return without one

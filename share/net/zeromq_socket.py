@@ -14,7 +14,7 @@ import zmq
 
 from share.errors import TransportError
 from share.net.transport import LINGER_MS, QUEUE_MESSAGES, Address
-from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
+from share.wire.layouts import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
 
 MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; further parts are read and discarded
 WAKE = b"w"  # written to the wake socket by `wake`

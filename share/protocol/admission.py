@@ -8,7 +8,7 @@ from math import ceil
 from share.config import EdgeConfig
 from share.mapping.loops import KeyframeKey
 from share.protocol.edge_events import PeerMessageReceived
-from share.protocol.peer import Peer, RestoredRun
+from share.protocol.peer import Peer, RestoredRun, Sender
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
 from share.wire.messages import Hello, PoseUpdate, public_tag
 
@@ -80,16 +80,15 @@ class Admission:
         """Count a run that has joined."""
         self._new_run_limits.record(hello.name, event.credential, now_ns)
 
-    def is_name_stale(self, name: str, peers: Mapping[bytes, Peer], now_ns: int) -> bool:
+    def is_name_stale(self, name: str, runs: RunRegistry, now_ns: int) -> bool:
         """Return whether the present run of this name is silent: its agent may have been killed and
         restarted."""
-        present = [peer for peer in peers.values() if not peer.is_gone and peer.name == name]
-        received_ns = [peer.last_received_ns for peer in present]
+        received_ns = [peer.last_received_ns for peer in runs.present() if peer.name == name]
         return bool(received_ns) and now_ns - max(received_ns) > seconds_to_ns(_SILENT_S)
 
-    def capacity_objection(self, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int) -> str | None:
+    def capacity_objection(self, hello: Hello, runs: RunRegistry, now_ns: int) -> str | None:
         """Return why an absent run may not become present beside the others; None if it may."""
-        present = [peer for peer in peers.values() if not peer.is_gone]
+        present = runs.present()
         for peer in present:
             since_ns = now_ns - peer.last_received_ns
             if peer.name == hello.name and since_ns < seconds_to_ns(NAME_HOLD_S):
@@ -123,10 +122,12 @@ _MAX_FORGOTTEN = 65_536  # forgotten runs that are still recognised; older ones 
 
 class RunRegistry(Mapping[bytes, Peer]):
     """Runs by their peer id on the link. Each run has a key that names it everywhere else; the run of a name
-    that joined or came back last is the latest."""
+    that joined or came back last is the latest. unjoined: what is counted of all other peers together."""
 
     def __init__(self) -> None:
+        self.unjoined = Sender()
         self.by_key: dict[str, Peer] = {}
+        self._present: dict[str, Peer] = {}
         self._peers: dict[bytes, Peer] = {}
         self._runs_by_name: dict[str, dict[str, Peer]] = {}  # by key, the latest last
         self._empty_runs: dict[str, int] = {}  # runs without anything in the map: their newest keyframe
@@ -142,19 +143,39 @@ class RunRegistry(Mapping[bytes, Peer]):
     def __len__(self) -> int:
         return len(self._peers)
 
+    def sender(self, peer_id: bytes) -> Sender:
+        """Return the run, or `unjoined`."""
+        return self.get(peer_id) or self.unjoined
+
+    def present(self) -> list[Peer]:
+        """Return the runs that have not left."""
+        return list(self._present.values())
+
+    def mark_present(self, peer: Peer) -> None:
+        """Record that a known run takes part; it becomes the latest of its name."""
+        peer.is_gone = False
+        self._present[peer.key] = peer
+        runs = self._runs_by_name.setdefault(peer.name, {})
+        runs.pop(peer.key, None)
+        runs[peer.key] = peer
+
+    def mark_gone(self, peer: Peer) -> None:
+        """Record that a run has left."""
+        peer.is_gone = True
+        self._present.pop(peer.key, None)
+
     def is_latest(self, peer: Peer) -> bool:
         """Return whether no other run of its name joined or came back later."""
         return next(reversed(self._runs_by_name[peer.name])) == peer.key
 
     def shares_map(self, peer: Peer) -> bool:
         """Return whether a run shares a map with another that is present, or no other is."""
-        others = [other for other in self.values() if other is not peer and not other.is_gone]
+        others = [other for other in self._present.values() if other is not peer]
         return not others or peer.map_id in {other.map_id for other in others} - {None}
 
     def latest_poses(self) -> dict[str, PoseUpdate]:
         """Return the newest pose of each present run, by run key."""
-        present = (peer for peer in self.values() if not peer.is_gone)
-        return {peer.key: peer.latest_pose for peer in present if peer.latest_pose is not None}
+        return {key: peer.latest_pose for key, peer in self._present.items() if peer.latest_pose is not None}
 
     def label(self, peer: Peer) -> str:
         """Return the run's label in reports: its name if it is the latest, else name/tag. No name contains
@@ -163,19 +184,15 @@ class RunRegistry(Mapping[bytes, Peer]):
         return peer.name if self.is_latest(peer) else f"{peer.name}/{tag}"
 
     def add(self, peer: Peer) -> None:
-        """Add a run; it becomes the latest of its name."""
+        """Add a run that takes part."""
         self._peers[peer.id] = self.by_key[peer.key] = peer
-        self.make_latest(peer)
-
-    def make_latest(self, peer: Peer) -> None:
-        """Make a known run the latest of its name."""
-        runs = self._runs_by_name.setdefault(peer.name, {})
-        runs.pop(peer.key, None)
-        runs[peer.key] = peer
+        self.mark_present(peer)
 
     def restore(self, run: RestoredRun) -> None:
-        """Add a run of an earlier session."""
-        self.add(run.peer())
+        """Add a run of an earlier session, which is absent."""
+        peer = run.peer()
+        self.add(peer)
+        self.mark_gone(peer)
         if run.odometry_base is None:
             self._empty_runs[run.key] = -1
 
@@ -197,6 +214,7 @@ class RunRegistry(Mapping[bytes, Peer]):
     def forget(self, peer: Peer) -> bool:
         """Remove a run for good. Return whether it was the latest of its name."""
         del self.by_key[peer.key], self._peers[peer.id]
+        self._present.pop(peer.key, None)
         self._empty_runs.pop(peer.key, None)
         was_latest = self.is_latest(peer)
         del self._runs_by_name[peer.name][peer.key]

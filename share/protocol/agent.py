@@ -12,23 +12,21 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from share.config import Config
-from share.errors import UsageError, VersionError, WireError, printable
+from share.errors import UsageError, WireError
 from share.metrics.frame_log import summary
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
 from share.protocol.agent_status import StatusReporter, with_link
 from share.protocol.edge_clock import ClockEstimate, PingTracker
-from share.protocol.edge_sessions import EdgeSessions
+from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
 from share.protocol.keyframe_pace import KeyframePace
 from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
-from share.protocol.versions import EdgeVersionProbe
 from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
 from share.types import F64, Correction, KeyframeCandidate
 from share.wire import messages as m
-from share.wire.codec import Bytes, decode, encode, message_bytes
+from share.wire.codec import encode, message_bytes
+from share.wire.layouts import Bytes
 
-HELLO_S = 0.5  # interval of hellos, until welcomed
-REFUSED_S = 5.0  # a running agent that was refused asks again after this
 EVALUATION_S = 1.0  # longest interval of evaluations: with few keyframes the edge has to know sooner
 NO_KEYFRAME = -1  # of an evaluation between keyframes
 _COUNTERS = (
@@ -57,24 +55,14 @@ class Agent:
 
     def __init__(self, hello: m.Hello, config: Config) -> None:
         self._config = config
-        self._name, self._hello = hello.name, encode(hello)
         self._keyframe_chain, self._pace = KeyframeChain(), KeyframePace()
         self._ledger = KeyframeLedger(config.agent.keep_keyframes, config.link.window)
         self._localisation = MapLocalisation(config.agent.blend_s)
         self._self_evaluation = SelfEvaluation()
         self._evaluation_timer = PeriodicTimer(EVALUATION_S)
         self._status_reporter = StatusReporter(self.slow_text)
-        # the edge
-        self._is_connected = False
-        self._sessions = EdgeSessions()
-        self._hello_timer = PeriodicTimer(HELLO_S)
+        self._connection = EdgeConnection(hello, config.link.silent_s, self.offline_text)
         self._pings = PingTracker()
-        self._version_probe = EdgeVersionProbe()
-        self._refusal: str | None = None  # last reason that the edge gave
-        self._silence_limit_ns = seconds_to_ns(config.link.silent_s)
-        self._last_received_ns: int | None = None  # or the first event
-        self._silence_reported = False
-        # the run
         self._line_limiter = LineLimiter()
         self._finish_deadline_ns: int | None = None
         self._ended = False
@@ -89,8 +77,7 @@ class Agent:
         if self._ended:
             return []
         self._effects, self._now_ns = [], now_ns
-        if self._last_received_ns is None:
-            self._last_received_ns = now_ns
+        self._connection.begin(now_ns)
         self._status_reporter.begin(now_ns)
         match event:
             case ev.FrameTracked():
@@ -105,7 +92,7 @@ class Agent:
                 self._status_reporter.finish()
                 self._finish_deadline_ns = now_ns + seconds_to_ns(self._config.agent.finish_s)
             case ev.Connected():  # a welcome tells sooner than a pong whether this edge knows us
-                self._version_probe.mark_reached()
+                self._connection.mark_reached()
                 self._send_hello()
             case ev.AgentTick():
                 self._status_reporter.add_tick(event)
@@ -120,7 +107,7 @@ class Agent:
     @property
     def is_connected(self) -> bool:
         """Whether an edge has welcomed it and is not silent."""
-        return self._is_connected
+        return self._connection.is_connected
 
     def report(self) -> dict[str, Any]:
         """Return counters and the present state as plain data."""
@@ -133,12 +120,12 @@ class Agent:
             "unacknowledged": self._ledger.unacknowledged,
             "buffered_at_edge": self._ledger.buffered_at_edge,
             "rate_hz": self._pace.hz,
-            "connected": self._is_connected,
-            "edge_session": self._sessions.session,
-            "edge_sessions": len(self._sessions),
+            "connected": self.is_connected,
+            "edge_session": self._connection.sessions.session,
+            "edge_sessions": len(self._connection.sessions),
             "map_id": self._localisation.map_frame.map_id,
-            "revision": self._sessions.revision,
-            "refusal": self._refusal,
+            "revision": self._connection.sessions.revision,
+            "refusal": self._connection.refusal,
             "settle_s": summary(list(self._localisation.settle_s)).report(),
             **self._pings.clock.report(),
         }
@@ -170,7 +157,7 @@ class Agent:
     def _publish_pose(self, frame: ev.FrameTracked, T_odom_body: F64) -> None:
         drift_cov = self._self_evaluation.drift.cov
         self._effects.append(self._localisation.localise(frame, T_odom_body, drift_cov, self._now_ns))
-        if self._is_connected and self.makes_keyframes and self._pace.take_pose(self._now_ns):
+        if self.is_connected and self.makes_keyframes and self._pace.take_pose(self._now_ns):
             self._counts["poses"] += 1
             last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
             self._send(pose_update(frame, T_odom_body, last, first, self._now_ns))
@@ -183,7 +170,7 @@ class Agent:
         self._counts["candidates"] += 1
         self._self_evaluation.add_processing_time((self._now_ns - frame.arrived_ns) / 1e6)
         self._keyframe_chain.extend(candidate)
-        unacknowledged = len(self._ledger.pending) if self._is_connected else 0
+        unacknowledged = len(self._ledger.pending) if self.is_connected else 0
         sent = self._pace.take(candidate, unacknowledged, self._now_ns)
         if sent:
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
@@ -197,7 +184,7 @@ class Agent:
     def _send_evaluation(self, keyframe: int) -> None:
         """Send delay and error with a keyframe, or between two if -1."""
         self._evaluation_timer.postpone(self._now_ns + seconds_to_ns(EVALUATION_S))
-        if self._is_connected and (evaluation := self.evaluation(keyframe, self._now_ns)) is not None:
+        if self.is_connected and (evaluation := self.evaluation(keyframe, self._now_ns)) is not None:
             self._send(evaluation)
 
     def evaluation(self, keyframe: int, now_ns: int) -> m.Evaluation | None:
@@ -215,13 +202,14 @@ class Agent:
     def _on_received(self, frames: Sequence[Bytes]) -> None:
         self._counts["bytes_down"] += message_bytes(frames)
         try:
-            message = self._decode(frames)
+            message, line = self._connection.decode(frames)
         except WireError as error:
             self._report_invalid(f"invalid message from the edge: {error}")
             return
         if message is None:
+            self._print(line)
             return
-        self._last_received_ns = self._now_ns
+        self._connection.mark_received(self._now_ns)
         match message:
             case m.Welcome():
                 self._on_welcome(message)
@@ -249,17 +237,6 @@ class Agent:
         name = type(message).__name__
         self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
 
-    def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
-        """Decode a message. Print a line and return None for an edge of an older version. Raises
-        WireError."""
-        try:
-            return decode(frames)
-        except VersionError as error:
-            if (line := self._version_probe.check_message(frames, error)) is not None:
-                self._silence_reported = True
-                self._print(f"{line}; {self.offline_text}")
-            return None
-
     def _report_invalid(self, text: str) -> None:
         """Count a message that no edge should send, and print it if new."""
         self._counts["bad_messages"] += 1
@@ -274,25 +251,19 @@ class Agent:
         return is_sent
 
     def _on_welcome(self, welcome: m.Welcome) -> None:
-        if self._sessions.is_past(welcome.session):
-            return
         if not self._is_of_sent("a welcome", welcome.next_keyframe - 1):
             return
-        if self._sessions.is_unsolicited(welcome.session):
-            self._report_invalid("the edge sent a welcome without a hello; ignored")
-            return
-        was_disconnected, self._is_connected, self._silence_reported = not self._is_connected, True, False
-        self._version_probe.mark_answered()
-        if welcome.session != self._sessions.session:
-            self._begin_session(welcome)
-        elif was_disconnected:
-            self._ledger.resume(welcome)
-            self._print("reconnected to the edge")
+        is_restart = self._connection.sessions.session is not None
+        match self._connection.welcome(welcome):
+            case WelcomeOutcome.UNSOLICITED:
+                self._report_invalid("the edge sent a welcome without a hello; ignored")
+            case WelcomeOutcome.NEW_SESSION:
+                self._begin_session(welcome, is_restart)
+            case WelcomeOutcome.RECONNECTED:
+                self._ledger.resume(welcome)
+                self._print("reconnected to the edge")
 
-    def _begin_session(self, welcome: m.Welcome) -> None:
-        is_restart = self._sessions.session is not None
-        self._sessions.begin(welcome.session)
-        self._refusal = None
+    def _begin_session(self, welcome: m.Welcome, is_restart: bool) -> None:
         self._pace.begin_session(self._now_ns)
         self._pings.begin_session()
         pending = self._ledger.begin_session(welcome)
@@ -306,24 +277,21 @@ class Agent:
         return f"{pending} keyframes are resent"
 
     def _on_refused(self, refused: m.Refused) -> None:
-        self._refusal = printable(refused.reason)
-        text = f"the edge refuses '{self._name}': {self._refusal}"
-        is_new_run = self._status_reporter.has_just_begun(self._now_ns, self._silence_limit_ns)
-        if self._sessions.session is None and is_new_run:
+        text = self._connection.refuse(refused, self._now_ns)
+        is_new_run = self._status_reporter.has_just_begun(self._now_ns, self._connection.silence_limit_ns)
+        if self._connection.sessions.session is None and is_new_run:
             self._ended = True
             self._effects.append(ev.FailRun(UsageError(text)))
-            return
-        self._is_connected = False
-        self._hello_timer.postpone(self._now_ns + seconds_to_ns(REFUSED_S))
-        self._print(f"{text}; {self.offline_text}")
+        else:
+            self._print(f"{text}; {self.offline_text}")
 
     def _on_correction(self, correction: Correction) -> None:
         answered = correction.answered_keyframe
         if not self._is_of_sent("a correction", correction.segment_keyframe, answered):
             return
         is_of_segment = correction.segment_keyframe >= self._keyframe_chain.first_of_segment
-        is_current = self._is_connected and is_of_segment
-        if not (is_current and self._sessions.accept_revision(correction.revision)):
+        is_current = self.is_connected and is_of_segment
+        if not (is_current and self._connection.sessions.accept_revision(correction.revision)):
             self._counts["corrections_stale"] += 1
             return
         self._counts["corrections"] += 1
@@ -337,23 +305,23 @@ class Agent:
     def _on_pong(self, pong: m.Pong) -> None:
         if not self._pings.take_answer(pong):
             return
-        if pong.session != self._sessions.session:
-            self._is_connected = False  # the edge has restarted and does not know us: hello
+        if pong.session != self._connection.sessions.session:
+            self._connection.is_connected = False  # the edge has restarted and does not know us: hello
             return
         self._pings.measure(pong, self._now_ns)
 
     # ------------------------------------------------------------ messages to the edge
 
     def _send_due(self) -> None:
-        self._check_silence()
+        self._print(self._connection.check_silence(self._now_ns))
         self._send_status()
-        if self._is_connected:
+        if self.is_connected:
             if (ping := self._pings.due_ping(self._now_ns)) is not None:
                 self._send(ping)
             self._send_data()
             if self.makes_keyframes and self._evaluation_timer.fire_if_due(self._now_ns):
                 self._send_evaluation(NO_KEYFRAME)
-        elif self._hello_timer.fire_if_due(self._now_ns):
+        elif self._connection.is_hello_due(self._now_ns):
             self._send_hello()
         deadline_ns = self._finish_deadline_ns
         if deadline_ns is not None and (self._is_idle or self._now_ns >= deadline_ns):
@@ -369,30 +337,18 @@ class Agent:
         return not self._ledger.pending
 
     def _send_hello(self) -> None:
-        self._hello_timer.postpone(self._now_ns + seconds_to_ns(HELLO_S))
-        self._sessions.expect_welcome()
-        for frames in (self._hello, *self._version_probe.pings(self._now_ns)):
+        for frames in self._connection.hello(self._now_ns):
             self._send_frames(frames)
-
-    def _check_silence(self) -> None:
-        assert self._last_received_ns is not None
-        if self._now_ns - self._last_received_ns <= self._silence_limit_ns:
-            return
-        self._is_connected = False
-        if not self._silence_reported:
-            self._silence_reported = True
-            problem = "the edge is silent" if self._sessions.session is not None else "no edge answers yet"
-            self._print(f"{problem}; {self.offline_text}")
 
     def _send_status(self) -> None:
         if (report := self._status_reporter.due_report(self._now_ns)) is not None:
             self._effects.append(report)
-            if self._is_connected:
+            if self.is_connected:
                 waiting_ns = self._ledger.unacknowledged_for_ns(self._now_ns)
                 self._send(with_link(report.status, waiting_ns, self.clock_estimate(self._now_ns)))
 
     def _finish(self) -> None:
-        if self._is_connected:
+        if self.is_connected:
             self._send(m.Bye())
         self._ended = True
         self._effects.append(ev.CloseLink())
@@ -409,6 +365,6 @@ class Agent:
         if isinstance(effect, ev.SendToEdge) and effect.keyframe_id is not None:
             self._ledger.record_send_failure(effect.keyframe_id)
 
-    def _print(self, text: str) -> None:
-        if (line := self._line_limiter.admit(text, self._now_ns)) is not None:
+    def _print(self, text: str | None) -> None:
+        if text is not None and (line := self._line_limiter.admit(text, self._now_ns)) is not None:
             self._effects.append(ev.PrintLine(line))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from share.errors import ShareError
 from share.types import F64, Frame, KeyframeCandidate, TrackState, WaitReason
-from share.wire.codec import Bytes
+from share.wire.layouts import Bytes
 from share.wire.messages import Status
 
 # ---------------------------------------------------------------- events

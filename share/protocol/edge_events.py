@@ -13,7 +13,7 @@ from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange
 from share.types import Frame, Keyframe
 from share.wire import messages as wire
-from share.wire.codec import Bytes
+from share.wire.layouts import Bytes
 
 # ---------------------------------------------------------------- events
 

@@ -1,4 +1,4 @@
-"""The edge's bookkeeping: event log, durability of keyframes, totals over mapper restarts."""
+"""The edge's bookkeeping: effects, event log, durability of keyframes, totals over mapper restarts."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from typing import Any
 
 from share.event_kinds import EventKind
 from share.mapping.map_changes import MapChange
-from share.protocol.edge_events import SaveChanges, WriteEvent
+from share.protocol.admission import RunRegistry
+from share.protocol.edge_events import EdgeEffect, SaveChanges, SendToPeer, WriteEvent
 from share.protocol.peer import Peer
 from share.timing import Throttle
+from share.wire.codec import WIRE_VERSION, encode, message_bytes
+from share.wire.messages import DownlinkMessage
 
 # Limits on the events of one kind that one agent can cause: short-term, and sustained.
 _EVENT_HZ, _EVENT_BURST = 1.0, 20.0
@@ -91,6 +94,46 @@ class DurabilityTracker:
     def take_durable(self) -> list[Peer]:
         """Return the peers with newly durable keyframes that wait for no ticket."""
         return self.mark_saved(self._saved_ticket if self._has_store else self._ticket)
+
+
+class EdgeOutput:
+    """Collects the effects of one event: messages, records, changes to be stored. now_ns: its time."""
+
+    def __init__(self, registry: RunRegistry, has_store: bool, began_ns: int | None) -> None:
+        self.effects: list[EdgeEffect] = []
+        self.now_ns = 0
+        self.durability = DurabilityTracker(has_store)
+        self._registry, self._event_log = registry, EventLog(began_ns)
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the origin of the times in records."""
+        return self._event_log.elapsed_s(self.now_ns)
+
+    def begin(self, now_ns: int) -> None:
+        """Start the effects of the next event."""
+        self._event_log.start(now_ns)
+        self.effects, self.now_ns = [], now_ns
+
+    def add(self, *effects: EdgeEffect) -> None:
+        self.effects.extend(effects)
+
+    def send(self, peer_id: bytes, message: DownlinkMessage, version: int = WIRE_VERSION) -> None:
+        frames = encode(message, version)
+        self._registry.sender(peer_id).counts["bytes_down"] += message_bytes(frames)
+        self.add(SendToPeer(peer_id, frames))
+
+    def record(
+        self, event: EventKind, peer: Peer | None, reason: str, throttled: bool = True, **fields: Any
+    ) -> None:
+        """Record an event. throttled: unless it is repeated too often, as a peer could cause it."""
+        make = self._event_log.throttled_event if throttled else self._event_log.event
+        if (effect := make(self.now_ns, event, peer.name if peer else None, reason, **fields)) is not None:
+            self.add(effect)
+
+    def save(self, *changes: MapChange) -> None:
+        if (effect := self.durability.save(changes)) is not None:
+            self.add(effect)
 
 
 _MERGE_COUNTS = (("merges", "requested"), ("merges", "skipped"), ("merges", "done"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from share.protocol.agent_ledger import KeyframeScore
-from share.scheduling.keyframe_window import KeyframeWindow
+from share.scheduling.base_delay import BaseDelay
 from share.timing import TokenBucket
 from share.types import KeyframeCandidate
 from share.wire.messages import Rate
@@ -63,3 +63,28 @@ class KeyframePace:
         is_preferred = self._score.is_above_median(candidate)
         has_room = self._window is None or unacknowledged < self._window.size
         return has_room and self._bucket.take(now_ns, is_preferred)
+
+
+MAX_KEYFRAMES = 3  # a keyframe under way, one at the edge, one whose acknowledgement comes back
+LATE_MS = 100.0  # an acknowledgement that takes so much longer than the fastest has met a queue
+
+
+class KeyframeWindow:
+    """How many keyframes may be unacknowledged at a time: a congestion window with slow start (M. Allman et
+    al., *TCP Congestion Control*, RFC 5681), with delay as the sign of congestion (LEDBAT, RFC 6817): over a
+    radio nothing is lost, it queues. It grows by one with each acknowledgement in time, and is halved by each
+    late one."""
+
+    def __init__(self) -> None:
+        self._size, self._base = 1.0, BaseDelay()
+
+    @property
+    def size(self) -> int:
+        """Number of keyframes that may be unacknowledged, 1 to MAX_KEYFRAMES."""
+        return int(self._size)
+
+    def acknowledge(self, ack_ms: float, now_ns: int) -> None:
+        """Record an acknowledgement, `ack_ms` after its keyframe was sent."""
+        self._base = self._base.with_delay(ack_ms, now_ns)
+        is_late = ack_ms > self._base.ms + LATE_MS
+        self._size = max(1.0, self._size / 2) if is_late else min(MAX_KEYFRAMES, self._size + 1)

@@ -150,25 +150,25 @@ class TrackingEdge(Edge):
                 tracker.is_ready = True
                 self._welcome(peer)
             case ed.TrackerAnswered():
-                peer.status.add_pose(event.result.state, self._now_ns)
-                self._send(peer.id, event.result)
-                self._effects.extend(tracker.take_answer(event.result, self._now_ns))
+                peer.status.add_pose(event.result.state, self._out.now_ns)
+                self._out.send(peer.id, event.result)
+                self._out.add(*tracker.take_answer(event.result, self._out.now_ns))
             case ed.TrackerLost():
                 should_restart = tracker.record_loss()
                 reason = f"its process {event.reason}; odometry starts again"
-                self._record("tracking lost", peer, reason, throttled=False)
+                self._out.record("tracking lost", peer, reason, throttled=False)
                 if should_restart:
-                    self._effects.extend(tracker.start())
+                    self._out.add(*tracker.start())
                 else:  # it sends a hello again after a while
-                    self._send(peer.id, wire.Refused(f"its tracking process {event.reason}"))
+                    self._out.send(peer.id, wire.Refused(f"its tracking process {event.reason}"))
 
     def _on_agent_message(self, peer: Peer, message: wire.Message) -> None:
         match message:
             case wire.Status():
-                peer.status.update(message, self._now_ns)
+                peer.status.update(message, self._out.now_ns)
             case Frame():
                 try:
-                    self._effects.extend(self._trackers[peer.key].offer_frame(message, self._now_ns))
+                    self._out.add(*self._trackers[peer.key].offer_frame(message, self._out.now_ns))
                 except ValueError as error:
                     self._count_bad_message(peer, str(error))
             case _:
@@ -200,7 +200,7 @@ class TrackingEdge(Edge):
     def _welcome(self, peer: Peer) -> None:
         """Send the welcome now, or as soon as the tracker is ready."""
         tracker = self._trackers[peer.key]
-        self._effects.extend(tracker.start())
+        self._out.add(*tracker.start())
         if tracker.is_ready:
             super()._welcome(peer)
 
@@ -209,11 +209,11 @@ class TrackingEdge(Edge):
 
     def _readmit(self, peer: Peer) -> None:
         super()._readmit(peer)
-        self._effects.extend(self._trackers[peer.key].start())
+        self._out.add(*self._trackers[peer.key].start())
 
     def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
         super()._mark_gone(peer, event, reason)
-        self._effects.extend(self._trackers[peer.key].stop())
+        self._out.add(*self._trackers[peer.key].stop())
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         return super()._peer_report(peer) | self._trackers[peer.key].report()

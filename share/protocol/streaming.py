@@ -177,7 +177,7 @@ class StreamingAgent(Agent):
 
     def _on_frame_arrived(self, event: ev.FrameArrived) -> None:
         self._status_reporter.add_image(event.arrived_ns)
-        self._streamer.add_frame(event, self._is_connected)
+        self._streamer.add_frame(event, self.is_connected)
 
     def _on_other_message(self, message: Message) -> None:
         if not isinstance(message, RemoteTrackingResult):

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 from share import __version__
 from share.errors import VersionError
-from share.wire.codec import MESSAGE_CODES, OLDEST_VERSION, WIRE_VERSION, Bytes, decode, encode
+from share.wire.codec import OLDEST_VERSION, WIRE_VERSION, decode, encode
+from share.wire.layouts import MESSAGE_CODES, Bytes
 from share.wire.messages import Ping, Pong
 
 _MAX_UNANSWERED = 2  # unanswered hellos before older versions are tried

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from share.geometry.camera import Camera, Rig
-from share.recordings.bags.message_file import MessageFile
+from share.recordings.message_file import MessageFile
 from share.recordings.recording import Source
 from share.sensors.stamps import GAP_FACTOR
 from share.types import I64

@@ -24,7 +24,8 @@ from share.protocol.versions import EdgeVersionProbe
 from share.recordings.calibration import read_calibration
 from share.sensors.profile import HostProfile
 from share.sensors.profile_types import HostFacts, Profile
-from share.wire.codec import Bytes, decode, encode
+from share.wire.codec import decode, encode
+from share.wire.layouts import Bytes
 from share.wire.messages import Message, Ping, Pong
 
 _REALSENSE_MODEL = "RealSense"

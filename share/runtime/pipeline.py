@@ -16,7 +16,13 @@ from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.visual_tracker import VisualTracker
 from share.recordings.images import decode_frame
 from share.runtime.source import Source
-from share.sensors.sequencer import SequencerCounters, UndecodedFrame, rig_streams, sequence_frames
+from share.sensors.sequencer import (
+    FrameMerger,
+    SequencerCounters,
+    UndecodedFrame,
+    rig_streams,
+    sequence_frames,
+)
 from share.types import Frame, ImuBatch
 
 _MAX_MISFITS = (
@@ -49,8 +55,7 @@ def read_frames(
     CalibrationMismatchError if the first ten images, or all, have another size than the calibration.
     """
     rig = source.rig
-    bundles = sequence_frames(
-        source.measurements(),
+    merger = FrameMerger(
         rig_streams(rig),
         source.rate_hz,
         config.sequencer,
@@ -58,6 +63,7 @@ def read_frames(
         rig.timeshift_ns,
         source.imu_range,
     )
+    bundles = sequence_frames(source.measurements(), merger)
     skipped, unwarned = _SkippedFrames(on_damaged or partial(_count_loss, source)), set(_IMU_WARNINGS)
     silence_monitor = None if rig.imu is None or source.reports_silence else _ImuSilenceMonitor(notify)
     for bundle in bundles:

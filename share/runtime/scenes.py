@@ -1,4 +1,4 @@
-"""A recording or a run as a scene to export. A recording is tracked for that, as by `share track`."""
+"""A recording, a run or a map as a scene to export. A recording is tracked for that, as by `share track`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from share.config import Config
 from share.errors import DataError, UsageError
+from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
 from share.recordings.exports.scene import Progress, Scene, SceneAgent, SceneView, known_points
 from share.recordings.trajectory import Trajectory, read_tum
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
@@ -17,6 +18,8 @@ from share.runtime.offline_tracking import track_frames
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
+from share.store.export import file_names
+from share.store.keyframe_archive import KeyframeArchive
 from share.vision.image_codec import encode_jpeg
 
 _JPEG_QUALITY = 95  # of a keyframe's picture
@@ -101,3 +104,45 @@ def _run_files(folder: Path) -> dict[str, Path]:
 def _trajectory_file(folder: Path) -> Path | None:
     files = (folder / name for name in _RUN_FILES)
     return next((file for file in files if file.is_file() and file.stat().st_size), None)
+
+
+def map_scenes(stored_map: StoredMap, path: Path) -> list[Scene]:
+    """Return a scene for each map of the file `path`, the largest first. Raises UsageError if it is empty."""
+    if not stored_map.keyframes:
+        raise UsageError("the map is empty: there is nothing to export")
+    poses, archive = map_poses(stored_map), KeyframeArchive(path)
+    by_map: dict[str, dict[str, list[StoredKeyframe]]] = {}
+    for keyframe in stored_map.keyframes:
+        runs = by_map.setdefault(poses[keyframe.keyframe_key][0], {})
+        runs.setdefault(keyframe.run_key, []).append(keyframe)
+    names, rigs = file_names(stored_map), {run.run_key: run.hello.rig for run in stored_map.runs}
+    scenes = []
+    for map_name, runs in by_map.items():
+        agents, views = {}, []
+        for run_key, keyframes in runs.items():
+            keyframes.sort(key=lambda one: one.keyframe.stamp_ns)
+            T = np.array([poses[one.keyframe_key][1] for one in keyframes])
+            stamps = np.array([one.keyframe.stamp_ns for one in keyframes], np.int64)
+            agents[names[run_key]] = SceneAgent(Trajectory(stamps, T), rigs[run_key])
+            views += [
+                _view(names[run_key], one, pose, archive) for one, pose in zip(keyframes, T, strict=True)
+            ]
+        scenes.append(Scene(map_name, "map", agents, views))
+    return sorted(scenes, key=lambda scene: -len(scene.views))
+
+
+def _view(agent: str, stored: StoredKeyframe, T_map_body: np.ndarray, archive: KeyframeArchive) -> SceneView:
+    keyframe = stored.keyframe
+    return SceneView(
+        agent,
+        keyframe.id,
+        keyframe.stamp_ns,
+        T_map_body,
+        known_points(keyframe.points),
+        partial(_jpeg, archive, stored),
+    )
+
+
+def _jpeg(archive: KeyframeArchive, stored: StoredKeyframe) -> bytes:
+    found = archive.jpeg(stored.keyframe_key)
+    return b"" if found is None else found.tobytes()

@@ -34,7 +34,7 @@ def _open_mcap(path: Path, calibration: Calibration | None, frames: slice | None
 def _is_bag(path: Path) -> bool:
     if not (path.suffix in (".db3", ".bag") or (path / METADATA).is_file()):
         return False
-    from share.recordings.bags.message_file import is_bag
+    from share.recordings.bags.opening import is_bag
 
     return is_bag(path)
 

@@ -63,19 +63,8 @@ def rig_streams(rig: Rig) -> tuple[str, ...]:
     return (*rig.cameras, *((IMU,) if rig.imu else ()))
 
 
-def sequence_frames(
-    measurements: Iterable[Measurement],
-    streams: Collection[str],
-    rate_hz: float,
-    config: SequencerConfig,
-    counters: SequencerCounters,
-    imu_shift_ns: int = 0,
-    imu_range: ImuRange = _DEFAULT_IMU_RANGE,
-) -> Iterator[UndecodedFrame]:
+def sequence_frames(measurements: Iterable[Measurement], merger: FrameMerger) -> Iterator[UndecodedFrame]:
     """Merge measurements into frames by time.
-
-    streams: as from `rig_streams`. rate_hz: the frame rate, 0 if unknown. imu_shift_ns: IMU time minus camera
-    time. imu_range: samples beyond it are dropped (`share.sensors.imu_check`).
 
     Every frame has its partner image: cam1, or depth if there is no cam1; depth beside cam1 may be missing.
     Frames go without a dead partner (silent _DEAD_FACTOR times the longest wait) if IMU or depth is alive.
@@ -83,7 +72,7 @@ def sequence_frames(
     Streams may be out of step by up to imu_silent_ms, and out of order within themselves by reorder_ms,
     without any effect on the frames. Memory is bounded by these times.
     """
-    sequencer = FrameSequencer(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
+    sequencer = FrameSequencer(merger)
     for measurement in measurements:
         yield from sequencer.feed(measurement)
     yield from sequencer.finish()
@@ -92,17 +81,8 @@ def sequence_frames(
 class FrameSequencer:
     """`sequence_frames`, one measurement at a time."""
 
-    def __init__(
-        self,
-        streams: Collection[str],
-        rate_hz: float,
-        config: SequencerConfig,
-        counters: SequencerCounters,
-        imu_shift_ns: int = 0,
-        imu_range: ImuRange = _DEFAULT_IMU_RANGE,
-    ) -> None:
-        self._counters, self._repair = counters, StampRepair()
-        self._merger = FrameMerger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
+    def __init__(self, merger: FrameMerger) -> None:
+        self._merger, self._repair = merger, StampRepair()
 
     def feed(self, measurement: Measurement) -> Iterator[UndecodedFrame]:
         """Add a measurement; yield the frames that are complete now."""
@@ -122,7 +102,7 @@ class FrameSequencer:
         self._update_counters()
 
     def _update_counters(self) -> None:
-        repair, counters = self._repair, self._counters
+        repair, counters = self._repair, self._merger.counters
         counters.wraps, counters.jumps, counters.strays = repair.wraps, repair.jumps, repair.strays
         counters.backward = self._merger.backward + repair.past
 
@@ -171,7 +151,11 @@ class _Buffer:
 
 
 class FrameMerger:
-    """The state of `sequence_frames`: buffers of all streams, and which frames are complete."""
+    """The state of `sequence_frames`: buffers of all streams, and which frames are complete.
+
+    streams: as from `rig_streams`. rate_hz: the frame rate, 0 if unknown. imu_shift_ns: IMU time minus camera
+    time. imu_range: samples beyond it are dropped (`share.sensors.imu_check`).
+    """
 
     def __init__(
         self,
@@ -190,7 +174,7 @@ class FrameMerger:
         self._imu_check = ImuCheck(imu_range)
         self._newest_ns, self._first_ns = -(2**62), 2**62
         self._last_frame_ns: int | None = None
-        self._counters = counters
+        self.counters = counters
         self._tolerance_ns = _ns(config.sync_tolerance_ms)
         self._wait_ns = _ns(config.imu_silent_ms) + _ns(config.reorder_ms)
         self._imu_shift_ns, self._imu_ahead_ns = imu_shift_ns, max(imu_shift_ns, 0)
@@ -199,11 +183,11 @@ class FrameMerger:
     def add(self, stream: str, stamp: int, payload: Any) -> None:
         buffer = self.buffers[stream]
         if stamp == buffer.newest:
-            self._counters.duplicates += 1
+            self.counters.duplicates += 1
         elif not buffer.accepts(stamp):
             self.backward += 1
         elif not buffer.insert(stamp, payload):
-            self._counters.duplicates += 1
+            self.counters.duplicates += 1
         self._newest_ns = max(self._newest_ns, stamp)
         self._first_ns = min(self._first_ns, stamp)
 
@@ -221,7 +205,7 @@ class FrameMerger:
             self._images.pop_until(stamp)
             partners = [self._take_partner(buffer, stamp) for buffer in self._partners]
             if self._is_incomplete(partners):
-                self._counters.unpaired += 1 + sum(p is not None for p in partners)
+                self.counters.unpaired += 1 + sum(p is not None for p in partners)
             else:
                 yield self._make_frame(stamp, image0, partners)
         self._drop_old()
@@ -272,7 +256,7 @@ class FrameMerger:
 
     def _take_partner(self, buffer: _Buffer, stamp: int) -> Any | None:
         """Remove and return the first image within the tolerance; drop earlier ones, which are unpaired."""
-        self._counters.unpaired += len(buffer.pop_until(stamp - self._tolerance_ns - 1))
+        self.counters.unpaired += len(buffer.pop_until(stamp - self._tolerance_ns - 1))
         if buffer.items and buffer.items[0][0] <= stamp + self._tolerance_ns:
             return buffer.pop_until(buffer.items[0][0])[0][1]
         return None
@@ -283,7 +267,7 @@ class FrameMerger:
         images = dict(zip([name for name in (CAM1, DEPTH) if name in self.buffers], partners, strict=True))
         frame = UndecodedFrame(
             stamp_ns=stamp,
-            index=self._counters.frames,
+            index=self.counters.frames,
             image0=image0,
             image1=images.get(CAM1),
             depth=images.get(DEPTH),
@@ -291,8 +275,8 @@ class FrameMerger:
             gap_ns=gap,
         )
         self._last_frame_ns = stamp
-        self._counters.frames += 1
-        self._counters.gaps += gap > 0
+        self.counters.frames += 1
+        self.counters.gaps += gap > 0
         return frame
 
     def _take_imu(self, stamp: int) -> ImuBatch:
@@ -300,15 +284,15 @@ class FrameMerger:
         imu = self._imu
         if imu is None:
             return ImuBatch.empty()
-        self._counters.imu_dropped += len(imu.pop_until(stamp - MAX_JUMP_NS))
+        self.counters.imu_dropped += len(imu.pop_until(stamp - MAX_JUMP_NS))
         if imu.consumed_until >= stamp:  # the previous frame has the first sample after both
             return ImuBatch.empty()
         first = imu.first_from(stamp)
         batch = self._valid_samples(
             imu.pop_until(stamp if first is None or first > stamp + self._wait_ns else first)
         )
-        self._counters.imu_samples += len(batch)
-        self._counters.imu_silent += not len(batch)
+        self.counters.imu_samples += len(batch)
+        self.counters.imu_silent += not len(batch)
         return batch
 
     def _valid_samples(self, samples: list[tuple[int, Any]]) -> ImuBatch:
@@ -317,8 +301,8 @@ class FrameMerger:
             return ImuBatch.empty()
         stamps, table = np.array([s for s, _ in samples], np.int64), np.array([v for _, v in samples], float)
         valid = self._imu_check.valid_mask(stamps, table)
-        self._counters.imu_out_of_range = self._imu_check.out_of_range
-        self._counters.imu_spikes = self._imu_check.spikes
+        self.counters.imu_out_of_range = self._imu_check.out_of_range
+        self.counters.imu_spikes = self._imu_check.spikes
         if not valid.all():
             stamps, table = stamps[valid], table[valid]
         return ImuBatch(stamps, table[:, :3], table[:, 3:])
@@ -328,9 +312,9 @@ class FrameMerger:
         oldest = self._newest_ns - 2 * (self._wait_ns + self._tolerance_ns) - self._imu_ahead_ns
         for buffer in self._partners:
             if buffer.items and buffer.items[0][0] < oldest:
-                self._counters.unpaired += len(buffer.pop_until(oldest))
+                self.counters.unpaired += len(buffer.pop_until(oldest))
         if self._imu and self._imu.items and self._imu.items[0][0] < oldest - MAX_JUMP_NS:
-            self._counters.imu_dropped += len(self._imu.pop_until(oldest - MAX_JUMP_NS))
+            self.counters.imu_dropped += len(self._imu.pop_until(oldest - MAX_JUMP_NS))
 
 
 def _ns(ms: float) -> int:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +16,6 @@ from share.checks import MAX_SIGMA
 from share.errors import DataError
 from share.geometry.camera import Camera, rays
 from share.types import F64, MAX_JPEG_BYTES, MAX_PLANE, MAX_SURFACES, MAX_UV, U8, KeyframeImage
-from share.vision.decoder_complaints import with_complaints
 from share.vision.image_codec import check_complete, checked_header, decode_gray, encode_jpeg, image_format
 
 MAX_IMAGE_PIXELS = 2_400_000  # of a keyframe's image: 1920 x 1200; larger ones cost the edge too much
@@ -84,3 +87,33 @@ def decompress(image: KeyframeImage, camera: Camera) -> U8 | None:
         return None
     is_intact = not complaints and decoded.shape == (camera.height, camera.width)
     return decoded if is_intact else None
+
+
+# ---- What a decoder writes to stderr: libjpeg fills up a damaged image and says so nowhere else. A peer
+# could fill the log with such lines; and what was filled up is no image of its camera.
+
+T = TypeVar("T")
+_STDERR = 2
+_redirecting = threading.Lock()  # file descriptors belong to the whole process
+
+
+def with_complaints(decode: Callable[[], T]) -> tuple[T, str]:
+    """Return `decode()` and what it wrote to the process's stderr, which nobody else sees.
+
+    Other threads' lines of that moment count as its own: for a process whose other threads write none."""
+    with _redirecting:
+        try:
+            stderr = os.dup(_STDERR)
+        except OSError:  # closed, so nothing can be written
+            return decode(), ""
+        sink = os.memfd_create("complaints")
+        try:
+            os.dup2(sink, _STDERR)
+            try:
+                result = decode()
+            finally:
+                os.dup2(stderr, _STDERR)
+            return result, os.pread(sink, 4096, 0).decode(errors="replace")
+        finally:
+            os.close(stderr)
+            os.close(sink)

@@ -1,69 +1,28 @@
-"""Encode messages to byte frames and decode them; the layout is in docs/lookup/wire.md.
+"""Encode messages to byte frames and decode them; the format is in docs/lookup/wire.md.
 
 The first frame is a small msgpack header: wire version, message code, scalar fields, and dtype and shape of
 each array. Each array follows in its own frame, little-endian, C order, not copied. A declared size is
-compared with the bytes received before anything is allocated.
+compared with the bytes received before anything is allocated. What each message consists of:
+`share.wire.layouts`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from math import isfinite, prod
-from operator import attrgetter
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Any
 
 import msgspec
-import numpy as np
-from msgspec import Meta
-from numpy.typing import NDArray
 
-from share.checks import MAX_STAMP_NS, checked_id, checked_stamp
-from share.earlier_poses import MAX_SPANS, EarlierPoses
 from share.errors import VersionError, WireError, printable
-from share.geometry.camera import Camera, ImuNoise, Rig
-from share.types import (
-    DESCRIPTOR_BYTES,
-    F32,
-    F64,
-    I64,
-    MAX_ACCEL_M_S2,
-    MAX_GYRO_RAD_S,
-    MAX_JPEG_BYTES,
-    MAX_KEYPOINTS,
-    MAX_MAP_ID_LENGTH,
-    MAX_NAME_LENGTH,
-    MAX_SURFACES,
-    AgentKind,
-    Correction,
-    Frame,
-    ImuBatch,
-    Keyframe,
-    KeyframeImage,
-    TrackState,
-    View,
-    WaitReason,
-)
 from share.wire import messages as m
+from share.wire.layouts import KEYFRAME_WITHOUT_IMAGE, LAYOUT_BY_CODE, LAYOUTS, Bytes, Header, encode_plain
 
 WIRE_VERSION = 7
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
 MAX_HEADER_BYTES = 4096
-MAX_ARRAYS = 16
-MAX_FRAME_BYTES = max(MAX_KEYPOINTS * DESCRIPTOR_BYTES, MAX_JPEG_BYTES)  # of all messages but Frame
-MAX_IMAGE_BYTES = 4 * 1920 * 1200  # largest array of a Frame: a depth image
-
-Bytes = bytes | memoryview
-Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_BUFFERED)]
-Text = Annotated[str, Meta(max_length=m.MAX_TEXT_LENGTH)]
-Reason = Annotated[str, Meta(max_length=m.MAX_REASON_LENGTH)]
-Name = Annotated[str, Meta(max_length=MAX_NAME_LENGTH)]
-MapId = Annotated[str, Meta(max_length=MAX_MAP_ID_LENGTH)]
-
-_DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
+_IMAGE_VERSION = 6  # of the first keyframes with an image; map files keep older ones
+STABLE_MESSAGES = (m.Ping, m.Pong, m.Refused)  # the same since OLDEST_VERSION: peers find a mismatch by them
 
 
 class _VersionHeader(msgspec.Struct, array_like=True):
@@ -73,283 +32,8 @@ class _VersionHeader(msgspec.Struct, array_like=True):
     code: Any = None
 
 
-class _Header(msgspec.Struct, array_like=True):
-    version: int
-    code: int
-    scalars: msgspec.Raw
-    arrays: tuple[tuple[str, tuple[int, ...]], ...]
-
-
-_encoder = msgspec.msgpack.Encoder(enc_hook=lambda scalar: scalar.item())  # numpy scalars
 _decode_version = msgspec.msgpack.Decoder(_VersionHeader).decode
-_decode_header = msgspec.msgpack.Decoder(_Header).decode
-
-
-def _field_name(path: str) -> str:
-    return path.rpartition(".")[2]
-
-
-@dataclass(frozen=True)
-class _Array:
-    """One array of a message, by its attribute path. None in the shape: any length up to `max_length`. An
-    absent optional array has the shape (0,)."""
-
-    path: str
-    dtype: str
-    shape: tuple[int | None, ...]
-    optional: bool = False
-    max_length: int = MAX_KEYPOINTS
-    key: str = ""  # the name by which `build` takes it; by default that of the attribute
-
-    @cached_property
-    def name(self) -> str:
-        return self.key or _field_name(self.path)
-
-    @cached_property
-    def _getter(self) -> Callable[[object], Any]:
-        return attrgetter(self.path)
-
-    def get(self, message: object) -> NDArray[Any]:
-        value = self._getter(message)
-        absent = self.optional and value is None
-        return np.ascontiguousarray(() if absent else value, _DTYPES[self.dtype])
-
-    def decode(self, dtype: str, shape: tuple[int, ...], frame: Bytes) -> NDArray[Any] | None:
-        absent = self.optional and shape == (0,)
-        if dtype != self.dtype or not (absent or self._matches(shape)):
-            expected = f"expected {self.dtype} {self.shape}"
-            raise ValueError(f"{self.path}: {dtype[:8]} of shape {shape[:4]}, {expected}")
-        size = prod(shape) * _DTYPES[dtype].itemsize
-        if size > MAX_IMAGE_BYTES:
-            raise ValueError(f"{self.path}: {size} bytes, at most {MAX_IMAGE_BYTES}")
-        data = memoryview(frame)
-        if data.nbytes != size:
-            raise ValueError(f"{self.path}: {data.nbytes} bytes, its shape needs {size}")
-        if not size:
-            return None if absent else np.empty(shape, _DTYPES[dtype])
-        # copied only if unaligned, as short frames are in their message
-        array = np.frombuffer(data, _DTYPES[dtype]).reshape(shape)
-        return array if array.flags.aligned else array.copy()
-
-    def _matches(self, shape: tuple[int, ...]) -> bool:
-        return len(shape) == len(self.shape) and all(
-            0 <= have <= self.max_length if want is None else have == want
-            for want, have in zip(self.shape, shape, strict=True)
-        )
-
-
-class _Layout:
-    """Layout of one message type. scalars: types by attribute path, checked both when encoding and when
-    decoding. build: makes the message of all its fields by name."""
-
-    def __init__(self, code: int, build: Callable[..., m.Message], *arrays: _Array, **scalars: Any) -> None:
-        self.code, self.build, self.arrays = code, build, arrays
-        self._names, self._getters = tuple(map(_field_name, scalars)), tuple(map(attrgetter, scalars))
-        self._decoder = msgspec.msgpack.Decoder(tuple[tuple(scalars.values())])  # type: ignore[misc]
-
-    def encode_scalars(self, message: object) -> msgspec.Raw:
-        raw = _encoder.encode([get(message) for get in self._getters])
-        self.decode_scalars(raw)
-        return msgspec.Raw(raw)
-
-    def decode_scalars(self, raw: msgspec.Raw | bytes) -> dict[str, Any]:
-        values = self._decoder.decode(raw)
-        for value in values:
-            if isinstance(value, float) and not isfinite(value):
-                raise ValueError("a number is not finite")
-        return dict(zip(self._names, values, strict=True))
-
-    def decode_arrays(self, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any] | None]:
-        received, declared, expected = len(frames) - 1, len(header.arrays), len(self.arrays)
-        if not received == declared == expected:
-            raise ValueError(f"{received} array frames, {declared} declared, {expected} expected")
-        return {
-            array.name: array.decode(dtype, shape, frame)
-            for array, (dtype, shape), frame in zip(self.arrays, header.arrays, frames[1:], strict=True)
-        }
-
-
-def _pose(path: str, optional: bool = False) -> _Array:
-    return _Array(path, "<f8", (4, 4), optional)
-
-
-def _image(path: str, dtype: str = "|u1", optional: bool = False) -> _Array:
-    return _Array(path, dtype, (None, None), optional, m.MAX_IMAGE_SIDE)
-
-
-def _imu(path: str, dtype: str, *shape: int) -> _Array:
-    return _Array(path, dtype, (None, *shape), max_length=m.MAX_IMU_SAMPLES)
-
-
-def _build_hello(*, name: str, kind: AgentKind, run_id: int, streams_frames: bool, **rig: Any) -> m.Hello:
-    return m.Hello(name, kind, run_id, Rig(**rig), streams_frames)
-
-
-def _build_keyframe(
-    *,
-    uv: Any,
-    points: Any,
-    descriptors: Any,
-    jpeg: Any,
-    feature_uv: Any,
-    plane: Any,
-    rho_sigma: Any,
-    ids: Any,
-    T_earlier_body: Any,
-    earlier_cov: Any,
-    **fields: Any,
-) -> Keyframe:
-    image = KeyframeImage(jpeg, feature_uv, plane, rho_sigma)
-    earlier = EarlierPoses(ids, T_earlier_body, earlier_cov)
-    return Keyframe(**fields, view=View(uv, points, descriptors), image=image, earlier=earlier)
-
-
-def _build_keyframe_without_image(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
-    return Keyframe(**fields, view=View(uv, points, descriptors))
-
-
-def _build_frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Frame:
-    checked_id("index", fields["index"])
-    for name in ("stamp_ns", "gap_ns"):
-        checked_stamp(name, fields[name])
-    if len(stamps_ns) and not -MAX_STAMP_NS <= stamps_ns.min() <= stamps_ns.max() <= MAX_STAMP_NS:
-        raise ValueError(f"stamps_ns: outside ±{MAX_STAMP_NS}")
-    imu = ImuBatch(stamps_ns, gyro, accel)
-    if not (stamps_ns[1:] > stamps_ns[:-1]).all():
-        raise ValueError("stamps_ns: not strictly increasing")
-    for name, samples, limit in (("gyro", gyro, MAX_GYRO_RAD_S), ("accel", accel, MAX_ACCEL_M_S2)):
-        if np.abs(samples).max(initial=0.0) > limit:
-            raise ValueError(f"{name}: values beyond {limit:g}, the limit of any IMU")
-    depth: F32 | None = fields["depth"]
-    if depth is not None and not (np.isfinite(depth) & (depth >= 0)).all():
-        raise ValueError("depth: negative or non-finite values")
-    return Frame(**fields, imu=imu)
-
-
-_RIG: dict[str, Any] = {  # sent as maps by field name, checked by their types
-    "rig.cam0": Camera,
-    "rig.cam1": Camera | None,
-    "rig.depth": Camera | None,
-    "rig.imu": ImuNoise | None,
-    "rig.timeshift_s": float,
-}
-_KEYFRAME_ARRAYS = (
-    _pose("T_ref_body"),
-    _Array("cov", "<f8", (6, 6)),
-    _pose("T_odom_body"),
-    _Array("up", "<f8", (3,)),
-    _Array("view.uv", "<f4", (None, 2)),
-    _Array("view.points", "<f4", (None, 3)),
-    _Array("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
-)
-_KEYFRAME_SCALARS: dict[str, Any] = {
-    "id": Int64,
-    "reference": Int64,
-    "stamp_ns": Int64,
-    "predecessor": Int64,
-    "up_sigma": float,
-}
-_LAYOUTS: dict[type, _Layout] = {
-    m.Hello: _Layout(
-        1,
-        _build_hello,
-        _pose("rig.T_body_cam0"),
-        _pose("rig.T_cam1_cam0", optional=True),
-        _pose("rig.T_depth_cam0", optional=True),
-        **{"name": Name, "kind": AgentKind, "run_id": Int64, "streams_frames": bool} | _RIG,
-    ),
-    m.PoseUpdate: _Layout(
-        2,
-        m.PoseUpdate,
-        _pose("T_keyframe_body"),
-        stamp_ns=Int64,
-        state=TrackState,
-        keyframe=Int64,
-        age_ms=float,
-    ),
-    Keyframe: _Layout(
-        3,
-        _build_keyframe,
-        *_KEYFRAME_ARRAYS,
-        _Array("image.jpeg", "|u1", (None,), max_length=MAX_JPEG_BYTES),
-        _Array("image.uv", "<f4", (None, 2), max_length=MAX_SURFACES, key="feature_uv"),
-        _Array("image.plane", "<f4", (None, 3), max_length=MAX_SURFACES),
-        _Array("image.rho_sigma", "<f4", (None,), max_length=MAX_SURFACES),
-        _Array("earlier.ids", "<i8", (None,), max_length=MAX_SPANS),
-        _Array("earlier.T_earlier_body", "<f4", (None, 4, 4), max_length=MAX_SPANS),
-        _Array("earlier.cov", "<f4", (None, 6, 6), max_length=MAX_SPANS, key="earlier_cov"),
-        **_KEYFRAME_SCALARS,
-    ),
-    m.Evaluation: _Layout(
-        4,
-        m.Evaluation,
-        keyframe=Int64,
-        delay_ms=float,
-        error_cm=float | None,
-        track_ms=float,
-        rtt_ms=float,
-        ack_ms=float,
-        drift_cm=float,
-    ),
-    m.Ping: _Layout(5, m.Ping, sequence=Int64, sent_ns=Int64),
-    m.Bye: _Layout(6, m.Bye),
-    Frame: _Layout(
-        7,
-        _build_frame,
-        _image("image0"),
-        _image("image1", optional=True),
-        _image("depth", "<f4", optional=True),
-        _imu("imu.stamps_ns", "<i8"),
-        _imu("imu.gyro", "<f8", 3),
-        _imu("imu.accel", "<f8", 3),
-        stamp_ns=Int64,
-        index=Int64,
-        gap_ns=Int64,
-    ),
-    m.Status: _Layout(
-        8,
-        m.Status,
-        state=TrackState,
-        pose_age_ms=float,
-        reason=Reason,
-        unacknowledged_ms=float,
-        clock_error_ms=float | None,
-    ),
-    m.Welcome: _Layout(16, m.Welcome, session=Int64, next_keyframe=Int64),
-    m.Refused: _Layout(17, m.Refused, reason=Text),
-    m.Ack: _Layout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
-    Correction: _Layout(
-        19,
-        Correction,
-        _pose("T_map_odom"),
-        _Array("cov", "<f8", (6, 6)),
-        map_id=MapId,
-        revision=Int64,
-        segment_keyframe=Int64,
-        answered_keyframe=Int64,
-    ),
-    m.Rate: _Layout(20, m.Rate, hz=float, is_windowed=bool, pose_hz=float | None),
-    m.Pong: _Layout(
-        21, m.Pong, sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64
-    ),
-    m.RemoteTrackingResult: _Layout(
-        22,
-        m.RemoteTrackingResult,
-        _pose("T_odom_body", optional=True),
-        index=Int64,
-        stamp_ns=Int64,
-        state=TrackState,
-        is_keyframe=bool,
-        new_segment=bool,
-        is_consistent=bool,
-        waiting_for=WaitReason | None,
-    ),
-}
-MESSAGE_CODES = {message_type: layout.code for message_type, layout in _LAYOUTS.items()}
-_LAYOUT_BY_CODE = {layout.code: (cls.__name__, layout) for cls, layout in _LAYOUTS.items()}
-_IMAGE_VERSION = 6  # of the first keyframes with an image; map files keep older ones
-_KEYFRAME_WITHOUT_IMAGE = _Layout(3, _build_keyframe_without_image, *_KEYFRAME_ARRAYS, **_KEYFRAME_SCALARS)
-STABLE_MESSAGES = (m.Ping, m.Pong, m.Refused)  # the same since OLDEST_VERSION: peers find a mismatch by them
+_decode_header = msgspec.msgpack.Decoder(Header).decode
 
 # All that msgspec, numpy and our own validation raise on bad bytes.
 _DECODE_ERRORS = (msgspec.MsgspecError, ValueError, OverflowError, RecursionError)
@@ -363,14 +47,14 @@ def encode(message: m.Message, version: int | None = None) -> list[Bytes]:
     """
     version = WIRE_VERSION if version is None else version
     assert version == WIRE_VERSION or isinstance(message, STABLE_MESSAGES)
-    layout = _LAYOUTS[type(message)]
+    layout = LAYOUTS[type(message)]
     arrays = [array.get(message) for array in layout.arrays]
     table = [(field.dtype, array.shape) for field, array in zip(layout.arrays, arrays, strict=True)]
     try:
         scalars = layout.encode_scalars(message)
     except _DECODE_ERRORS as error:
         raise _wire_error(type(message).__name__, error) from None
-    header = _encoder.encode((version, layout.code, scalars, table))
+    header = encode_plain((version, layout.code, scalars, table))
     return [header, *(array.data.cast("B") if array.size else b"" for array in arrays)]
 
 
@@ -390,11 +74,11 @@ def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -
             code = start.code if isinstance(start.code, int) else None
             raise VersionError(start.version, code, WIRE_VERSION)
         header = _decode_header(frames[0])
-        if (known := _LAYOUT_BY_CODE.get(header.code)) is None:
+        if (known := LAYOUT_BY_CODE.get(header.code)) is None:
             raise WireError(f"unknown message type {header.code}")
         where, layout = known
-        if header.code == _KEYFRAME_WITHOUT_IMAGE.code and header.version < _IMAGE_VERSION:
-            layout = _KEYFRAME_WITHOUT_IMAGE
+        if header.code == KEYFRAME_WITHOUT_IMAGE.code and header.version < _IMAGE_VERSION:
+            layout = KEYFRAME_WITHOUT_IMAGE
         return layout.build(**layout.decode_scalars(header.scalars), **layout.decode_arrays(header, frames))
     except _DECODE_ERRORS as error:
         raise _wire_error(where, error) from None

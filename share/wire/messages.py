@@ -201,7 +201,7 @@ class Ack:
 @dataclass(frozen=True)
 class Rate:
     """Keyframes a second that the agent may send. is_windowed: and only while those that are not
-    acknowledged are few (`share.scheduling.keyframe_window`). pose_hz: poses a second; None: every one."""
+    acknowledged are few (`share.protocol.keyframe_pace`). pose_hz: poses a second; None: every one."""
 
     hz: float
     is_windowed: bool = False

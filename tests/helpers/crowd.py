@@ -109,7 +109,7 @@ class Walker(threading.Thread):
             self._handle(link, ev.KeyframeMade(frame, candidate))
 
     def _handle(self, link: AgentLink, event: ev.AgentEvent) -> None:
-        session = self.machine._sessions.session
+        session = self.machine._connection.sessions.session
         for effect in self.machine.handle(event, time.monotonic_ns()):
             match effect:
                 case ev.SendToEdge():
@@ -126,7 +126,7 @@ class Walker(threading.Thread):
                     raise effect.error
                 case ev.CloseLink():
                     self._ended = True
-        if self.machine._sessions.session != session:
+        if self.machine._connection.sessions.session != session:
             self.lives.append(Life(time.monotonic()))
 
 

@@ -13,7 +13,7 @@ from share.geometry.camera import Camera, ImuNoise, Rig
 from share.recordings.images import ArrayImage, decode_frame
 from share.recordings.recording import Source
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import SequencerCounters, rig_streams, sequence_frames
+from share.sensors.sequencer import FrameMerger, SequencerCounters, rig_streams, sequence_frames
 from share.types import Frame
 
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.02, 0.001, -0.001))
@@ -38,12 +38,12 @@ def live(count: int, depth_scale: float = 1000.0) -> Iterator[Measurement]:
 
 def frames(source: Source) -> list[Frame]:
     counters = SequencerCounters()
-    bundles = sequence_frames(
-        source.measurements(),
+    merger = FrameMerger(
         rig_streams(source.rig),
         source.rate_hz,
         SequencerConfig(),
         counters,
         source.rig.timeshift_ns,
     )
+    bundles = sequence_frames(source.measurements(), merger)
     return [decode_frame(bundle) for bundle in bundles]

@@ -5,7 +5,8 @@ from __future__ import annotations
 from share.net.backlog import PART_OVERHEAD_BYTES, SMALL_PARTS_FACTOR, Backlog, BacklogLimits, wire_bytes
 from share.net.connection_gate import FIRST_BLOCK_S, MAX_BLOCK_S, Blocklist
 from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS
-from share.wire.codec import MAX_FRAME_BYTES, MAX_HEADER_BYTES, MAX_IMAGE_BYTES
+from share.wire.codec import MAX_HEADER_BYTES
+from share.wire.layouts import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
 
 def test_the_largest_keyframe_is_less_than_a_message_may_have() -> None:

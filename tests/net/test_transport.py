@@ -26,7 +26,8 @@ from share.net.transport import (
     connect,
     parse_address,
 )
-from share.wire.codec import MAX_FRAME_BYTES, encode
+from share.wire.codec import encode
+from share.wire.layouts import MAX_FRAME_BYTES
 from share.wire.messages import Bye, Ping, peer_id
 
 

@@ -14,8 +14,7 @@ from share.geometry.camera import Camera
 from share.mapping.corrections import MapEvent
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
-from share.protocol.keyframe_intake import OdometryBase, sanitise
-from share.protocol.step_chain import StepChain
+from share.protocol.keyframe_intake import OdometryBase, StepChain, sanitise
 from share.types import Keyframe, KeyframeImage, View
 from share.vision.image_codec import encode_jpeg
 from share.vision.keyframe_images import Surfaces

@@ -10,8 +10,7 @@ from helpers.hellos import hello_of
 
 from share.earlier_poses import EarlierPoses
 from share.geometry import se3
-from share.protocol.keyframe_intake import OdometryBase, sanitise
-from share.protocol.step_chain import StepChain
+from share.protocol.keyframe_intake import OdometryBase, StepChain, sanitise
 from share.types import F64, Keyframe, View
 
 CAMERA = hello_of("ann", 1).rig.cam0

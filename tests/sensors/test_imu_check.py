@@ -10,7 +10,7 @@ import pytest
 from share.config import SequencerConfig
 from share.sensors.imu_check import ImuCheck, ImuRange
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import SequencerCounters, sequence_frames
+from share.sensors.sequencer import FrameMerger, SequencerCounters, sequence_frames
 
 STEP = 5_000_000
 MOTION = Path(__file__).parents[3] / "shared" / "data" / "motion"
@@ -176,7 +176,9 @@ def bundles(values: np.ndarray) -> tuple[list, SequencerCounters]:
     images = [Measurement("cam0", k * 10 * STEP, f"image {k}") for k in range(len(values) // 10)]
     counters = SequencerCounters()
     both = sorted([*samples, *images], key=lambda m: m.stamp_ns)
-    return list(sequence_frames(both, ("cam0", "imu"), 20.0, SequencerConfig(), counters)), counters
+    return list(
+        sequence_frames(both, FrameMerger(("cam0", "imu"), 20.0, SequencerConfig(), counters))
+    ), counters
 
 
 def test_frames_lack_rejected_samples_and_count_them() -> None:

@@ -42,7 +42,7 @@ def in_order(measurements: list[Measurement]) -> list[Measurement]:
 
 def run(measurements, streams=STEREO_IMU, config=CONFIG, rate=RATE):
     counters = SequencerCounters()
-    return list(sequence_frames(measurements, streams, rate, config, counters)), counters
+    return list(sequence_frames(measurements, FrameMerger(streams, rate, config, counters))), counters
 
 
 def plain(bundles) -> list[tuple]:
@@ -140,7 +140,10 @@ def test_a_frame_is_yielded_as_soon_as_it_is_complete(before):
             fed.append(m.stamp_ns)
             yield m
 
-    out = [(b.stamp_ns, fed[-1]) for b in sequence_frames(feed(), STEREO_IMU, RATE, CONFIG, counters)]
+    out = [
+        (b.stamp_ns, fed[-1])
+        for b in sequence_frames(feed(), FrameMerger(STEREO_IMU, RATE, CONFIG, counters))
+    ]
     assert all(now == stamp + before for stamp, now in out[:-1])
 
 
@@ -157,7 +160,9 @@ def test_an_imu_with_a_shifted_clock_gives_the_same_samples(shift):
             yield m
 
     for b, e in zip(
-        sequence_frames(feed(), STEREO_IMU, RATE, CONFIG, counters, imu_shift_ns=shift), expected, strict=True
+        sequence_frames(feed(), FrameMerger(STEREO_IMU, RATE, CONFIG, counters, imu_shift_ns=shift)),
+        expected,
+        strict=True,
     ):
         assert (b.stamp_ns, b.image0, b.image1) == (e.stamp_ns, e.image0, e.image1)
         assert (b.imu.stamps_ns - shift).tolist() == e.imu.stamps_ns.tolist()
@@ -224,7 +229,7 @@ def test_depth_beside_stereo_may_be_missing():
 
     streams = ("cam0", "cam1", "depth", "imu")
     out = []
-    for b in sequence_frames(feed(), streams, RATE, CONFIG, SequencerCounters()):
+    for b in sequence_frames(feed(), FrameMerger(streams, RATE, CONFIG, SequencerCounters())):
         out.append(b)
         late.append(fed[-1] - b.stamp_ns)
     assert [b.stamp_ns for b in out] == times.tolist()
@@ -246,7 +251,7 @@ def test_a_silent_imu_does_not_end_the_run():
             yield m
 
     counters = SequencerCounters()
-    for b in sequence_frames(feed(), STEREO_IMU, RATE, CONFIG, counters):
+    for b in sequence_frames(feed(), FrameMerger(STEREO_IMU, RATE, CONFIG, counters)):
         lateness[b.stamp_ns // STEP] = newest - b.stamp_ns
     assert sorted(lateness) == list(range(80))
     assert counters.imu_silent == 40

@@ -12,7 +12,7 @@ from helpers.map_changes import ANN, keyframe, pose, run, small_map
 from share.errors import UsageError
 from share.geometry import se3
 from share.mapping.map_changes import SaveKeyframe
-from share.store.map_scene import map_scenes
+from share.runtime.scenes import map_scenes
 from share.store.map_store import MapStore
 from share.types import KeyframeImage
 

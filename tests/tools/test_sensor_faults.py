@@ -12,7 +12,7 @@ from share.geometry.camera import Camera, ImuNoise, Rig
 from share.recordings.images import ArrayImage
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import CAM0, CAM1, IMU, Measurement
-from share.sensors.sequencer import SequencerCounters, sequence_frames
+from share.sensors.sequencer import FrameMerger, SequencerCounters, sequence_frames
 from share.types import Frame, ImuBatch
 
 moving_panel, sensor_faults = experiment("moving_panel"), experiment("sensor_faults")
@@ -143,7 +143,9 @@ def test_bad_stamps_go_through_the_sequencer(frames):
     assert all(1 <= wrong.sum() <= 12 for wrong in sorts)  # 2 % of 200 is 4
     assert sum(wrong.sum() for wrong in sorts) == (off != 0).sum()
     counters = SequencerCounters()
-    bundles = list(sequence_frames(arriving, (CAM0, CAM1, IMU), RATE_HZ, SequencerConfig(), counters))
+    bundles = list(
+        sequence_frames(arriving, FrameMerger((CAM0, CAM1, IMU), RATE_HZ, SequencerConfig(), counters))
+    )
     assert (np.diff([b.stamp_ns for b in bundles]) > 0).all()
     assert counters.duplicates > 0
     assert counters.backward > 0

@@ -36,7 +36,8 @@ from share.protocol.edge import Edge
 from share.types import F64, AgentKind, Keyframe, KeyframeImage, View
 from share.vision import corners
 from share.vision.keyframe_images import compress
-from share.wire.codec import MESSAGE_CODES, encode
+from share.wire.codec import encode
+from share.wire.layouts import MESSAGE_CODES
 from share.wire.messages import Ack, Bye, Hello, Ping, peer_id
 
 T = TypeVar("T")

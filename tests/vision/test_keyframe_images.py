@@ -22,9 +22,8 @@ from share.types import (
     KeyframeImage,
     View,
 )
-from share.vision.decoder_complaints import with_complaints
 from share.vision.image_codec import encode_jpeg, encode_png
-from share.vision.keyframe_images import Surfaces, compress, decompress, image_objection
+from share.vision.keyframe_images import Surfaces, compress, decompress, image_objection, with_complaints
 
 CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
 
@@ -245,7 +244,7 @@ def test_images_are_decoded_by_several_threads_at_once() -> None:
 
 def test_an_image_is_decoded_without_a_stderr() -> None:
     code = (
-        "import numpy as np; from share.vision.decoder_complaints import with_complaints;"
+        "import numpy as np; from share.vision.keyframe_images import with_complaints;"
         "print(with_complaints(lambda: 5))"
     )
     done = subprocess.run(["/bin/sh", "-c", f"exec {sys.executable} -c '{code}' 2>&-"], capture_output=True)

@@ -32,7 +32,7 @@ from share.types import (
     View,
     WaitReason,
 )
-from share.wire import codec
+from share.wire import codec, layouts
 from share.wire import messages as m
 
 POSE = np.eye(4)
@@ -108,11 +108,11 @@ def copied(frames: list) -> list[bytes]:
 
 
 def test_the_examples_cover_every_message() -> None:
-    assert {type(message) for message in EXAMPLES} == EVERY_CLASS == set(codec.MESSAGE_CODES)
+    assert {type(message) for message in EXAMPLES} == EVERY_CLASS == set(layouts.MESSAGE_CODES)
 
 
 def test_codes_are_unique() -> None:
-    assert len(set(codec.MESSAGE_CODES.values())) == len(codec.MESSAGE_CODES)
+    assert len(set(layouts.MESSAGE_CODES.values())) == len(layouts.MESSAGE_CODES)
 
 
 @given(messages)
@@ -149,8 +149,8 @@ def test_poses_relative_to_earlier_keyframes_come_as_they_were_sent() -> None:
 def test_the_largest_keyframe_image_is_decoded() -> None:
     sent = with_earlier(keyframe_with_image(MAX_SURFACES, MAX_JPEG_BYTES, 40), MAX_SPANS)
     assert same(codec.decode(copied(codec.encode(sent))), sent)
-    assert max(map(len, codec.encode(sent))) <= codec.MAX_FRAME_BYTES
-    guard = BacklogLimits.for_frame_size(codec.MAX_FRAME_BYTES)
+    assert max(map(len, codec.encode(sent))) <= layouts.MAX_FRAME_BYTES
+    guard = BacklogLimits.for_frame_size(layouts.MAX_FRAME_BYTES)
     assert codec.message_bytes(codec.encode(sent)) < guard.message_bytes  # else its connection is reset
 
 
@@ -344,7 +344,7 @@ def _message(code: int, scalars: object, table: list, frames: list[bytes]) -> li
 
 wrong_content = st.builds(
     _message,
-    st.sampled_from(sorted(codec.MESSAGE_CODES.values())) | st.integers(),
+    st.sampled_from(sorted(layouts.MESSAGE_CODES.values())) | st.integers(),
     nested,
     st.lists(
         st.tuples(

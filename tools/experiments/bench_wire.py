@@ -24,7 +24,8 @@ import numpy as np
 from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate_pair
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.types import Keyframe, KeyframeImage, TrackState, View
-from share.wire.codec import Bytes, decode, encode, message_bytes
+from share.wire.codec import decode, encode, message_bytes
+from share.wire.layouts import Bytes
 from share.wire.messages import Message, Ping, PoseUpdate
 
 

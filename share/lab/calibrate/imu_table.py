@@ -12,7 +12,7 @@ from share.errors import UsageError
 from share.files.yaml_file import read_yaml
 from share.geometry.camera import ImuNoise
 from share.recordings import tables
-from share.recordings.bags.message_file import is_message_file, open_messages
+from share.recordings.bags.opening import is_message_file, open_messages
 from share.recordings.calibration import IMU_CHAIN, imu_noise
 from share.recordings.losses import DataLosses
 from share.recordings.session import is_session, read_session

@@ -26,7 +26,8 @@ from share.files.yaml_file import read_yaml
 from share.lab.evaluate.shared_air import HEADER_BYTES, PACKET_BYTES, AirModel
 from share.net.transport import LINGER_MS, QUEUE_MESSAGES, AgentLink
 from share.plain_data import from_mapping
-from share.wire.codec import Bytes, message_bytes
+from share.wire.codec import message_bytes
+from share.wire.layouts import Bytes
 
 _PROBE_MS = 10.0  # added to two round trips before the first resend
 _TIMEOUT_MS = 200.0  # before the second resend, doubled for each further one

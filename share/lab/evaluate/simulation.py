@@ -37,7 +37,8 @@ from share.protocol.peer import restored_runs
 from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore
 from share.types import F64, KeyframeCandidate, TrackState
-from share.wire.codec import Bytes, message_bytes
+from share.wire.codec import message_bytes
+from share.wire.layouts import Bytes
 from share.wire.messages import Hello, peer_id
 
 _MS = 1_000_000

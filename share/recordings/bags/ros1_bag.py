@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import bz2
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cached_property, partial
 from pathlib import Path
@@ -19,15 +19,13 @@ from share.errors import DataError
 from share.files.reading import open_regular, read_errors
 from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.file import MAX_CHUNK_BYTES, BoundedFile, Topic
+from share.recordings.mcap.file import MAX_CHUNK_BYTES, BoundedFile
+from share.recordings.message_file import MessageFile, Messages, Topic
 from share.types import I64
 
 
-class Ros1Bag:
-    """A ROS 1 bag; every pass opens it again. Raises DataError if it is damaged or has no index."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
+class Ros1Bag(MessageFile):
+    """A ROS 1 bag. Raises DataError if it is damaged or has no index."""
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
@@ -41,31 +39,20 @@ class Ros1Bag:
         return out
 
     @cached_property
-    def log_times(self) -> Mapping[str, I64]:
+    def _channel_times(self) -> dict[int, I64]:
         with self._opened() as reader:
-            return {
-                topic.name: np.sort(
-                    np.array([e.time for i in topic.channels for e in reader.indexes.get(i, [])], np.int64)
-                )
-                for topic in self.topics.values()
-            }
+            return {id: np.array([e.time for e in index], np.int64) for id, index in reader.indexes.items()}
 
-    def metadata(self, name: str) -> dict[str, str]:
-        return {}
+    def _times(self, topic: Topic) -> list[I64]:
+        return [self._channel_times[id] for id in topic.channels if id in self._channel_times]
 
-    def messages(
-        self,
-        topics: Iterable[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        losses: DataLosses | None = None,
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """As `MessageFile.messages`. A damaged chunk ends the reading with a DataError."""
-        ids = {i for name in topics if name in self.topics for i in self.topics[name].channels}
-        if not ids:
+    def _read(self, topics: list[str], start_ns: int, end_ns: int, losses: DataLosses | None) -> Messages:
+        """A damaged chunk ends the reading with a DataError."""
+        channels = self.channels(topics)
+        if not channels:
             return
         with self._opened() as reader:
-            chosen = [one for one in reader.connections if one.id in ids]
+            chosen = [one for one in reader.connections if one.id in channels]
             for connection, stamp_ns, data in reader.messages(chosen, start_ns, end_ns):
                 try:
                     cdr = bytes(ros.typestore().ros1_to_cdr(data, connection.msgtype))

@@ -11,16 +11,17 @@ import heapq
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 import numpy as np
 
 from share.errors import DataError, UsageError
 from share.files.reading import MB, open_regular, read_errors
 from share.recordings.losses import DataLosses
+from share.recordings.message_file import MessageFile, Messages, Topic
 from share.types import I64
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -30,14 +31,6 @@ _MAX_WINDOW_LOG2 = 27  # zstd window, log2 of bytes
 _MESSAGE_INDEX = 0x07
 _RECORD_HEADER = struct.Struct("<BQ")
 _INDEX_HEADER = struct.Struct("<HI")  # channel id, bytes of entries
-
-
-class Topic(NamedTuple):
-    """A topic. kind: ROS message type, e.g. sensor_msgs/msg/Image. channels: their ids."""
-
-    name: str
-    kind: str
-    channels: tuple[int, ...]
 
 
 def damage_errors() -> tuple[type[Exception], ...]:
@@ -59,11 +52,11 @@ def check_magic(path: Path) -> None:
         raise DataError(f"{path}: is not an MCAP file, or is empty")
 
 
-class McapFile:
+class McapFile(MessageFile):
     """An MCAP file; every pass opens it again. Raises DataError if damaged or not closed properly."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         check_magic(path)
         summary = self._summary
         is_empty = summary and summary.statistics and not summary.statistics.message_count
@@ -83,22 +76,16 @@ class McapFile:
         return topics
 
     @cached_property
-    def log_times(self) -> dict[str, I64]:
-        """Sorted log times (N,) ns of each topic's messages, read from the index alone."""
-        per_channel: dict[int, list[I64]] = {}
+    def _channel_times(self) -> dict[int, I64]:
+        """Read from the index alone."""
+        out: dict[int, list[I64]] = {}
         with open_regular(self.path) as file:
             for chunk in self._summary.chunk_indexes:
                 for channel, offset in chunk.message_index_offsets.items():
-                    per_channel.setdefault(channel, []).append(self._read_index(file, offset))
-        return {
-            topic.name: np.sort(
-                np.concatenate([t for c in topic.channels for t in per_channel.get(c, [_NO_TIMES])])
-            )
-            for topic in self.topics.values()
-        }
+                    out.setdefault(channel, []).append(self._read_index(file, offset))
+        return {channel: np.concatenate(times) for channel, times in out.items()}
 
     def metadata(self, name: str) -> dict[str, str]:
-        """Return the metadata record `name`, or {}."""
         return dict(self._metadata.get(name, {}))
 
     @cached_property
@@ -115,25 +102,18 @@ class McapFile:
                 records[name] = Metadata.read(ReadDataStream(BoundedFile(file))).metadata
         return records
 
-    def messages(
-        self,
-        topics: Iterable[str],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        losses: DataLosses | None = None,
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, log time, CDR bytes) in order of log time, within [start_ns, end_ns).
+    def _times(self, topic: Topic) -> list[I64]:
+        return [self._channel_times[id] for id in topic.channels if id in self._channel_times]
 
-        losses: gets damaged chunks. Raises DataError if losses is None, or more than 5 % are damaged.
-        """
-        channels = {id: name for name in topics if name in self.topics for id in self.topics[name].channels}
-        lo, hi = start_ns or 0, 2**64 if end_ns is None else end_ns
+    def _read(self, topics: list[str], start_ns: int, end_ns: int, losses: DataLosses | None) -> Messages:
+        """Losses are whole chunks."""
+        channels = self.channels(topics)
         # chunks and messages by time, then by place in the file; a chunk without an index may have any
         waiting: list[tuple[int, int, int, Any]] = [
             (chunk.message_start_time, chunk.chunk_start_offset, -1, chunk)
             for chunk in self._summary.chunk_indexes
-            if chunk.message_end_time >= lo
-            and chunk.message_start_time < hi
+            if chunk.message_end_time >= start_ns
+            and chunk.message_start_time < end_ns
             and (not chunk.message_index_offsets or channels.keys() & chunk.message_index_offsets)
         ]
         heapq.heapify(waiting)
@@ -146,7 +126,7 @@ class McapFile:
                     yield channels[item.channel_id], at_ns, item.data
                     continue
                 for k, message in self._chunk_messages(file, item, losses, total):
-                    if message.channel_id in channels and lo <= message.log_time < hi:
+                    if message.channel_id in channels and start_ns <= message.log_time < end_ns:
                         held_bytes += len(message.data)
                         heapq.heappush(waiting, (message.log_time, place, k, message))
                 if held_bytes > MAX_HELD_BYTES:
@@ -198,9 +178,6 @@ class McapFile:
         if opcode != _MESSAGE_INDEX or len(data) != size or size % 16:
             raise self._damaged_error("its index is wrong")
         return np.frombuffer(data, "<i8").reshape(-1, 2)[:, 0].astype(np.int64)
-
-
-_NO_TIMES = np.zeros(0, np.int64)
 
 
 # ---- Chunks and summary

@@ -18,12 +18,13 @@ import numpy as np
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Rig
-from share.recordings.bags.message_file import MessageFile, open_messages
+from share.recordings.bags.opening import open_messages
 from share.recordings.calibration import Calibration
 from share.recordings.calibration_match import device_mismatch, fit_to_recording, unused_streams
 from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.rig import own_rig, own_serial
+from share.recordings.message_file import MessageFile
 from share.recordings.recording import UNBOUNDED_NS, Recording, select_span
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement

@@ -18,10 +18,10 @@ from share.files.json_file import parse_json
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.lens import EQUIDISTANT, RADTAN
-from share.recordings.bags.message_file import MessageFile
 from share.recordings.calibration import config_errors
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.file import damage_errors
+from share.recordings.message_file import MessageFile
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
 from share.types import F64
 

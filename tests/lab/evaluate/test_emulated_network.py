@@ -22,7 +22,8 @@ from share.lab.evaluate.emulated_network import (
     load_network,
 )
 from share.plain_data import from_mapping
-from share.wire.codec import Bytes, encode
+from share.wire.codec import encode
+from share.wire.layouts import Bytes
 from share.wire.messages import Ping
 
 MS = 1_000_000

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.scheduling.keyframe_window import MAX_KEYFRAMES, KeyframeWindow
+from share.protocol.keyframe_pace import MAX_KEYFRAMES, KeyframeWindow
 
 S = 1_000_000_000
 

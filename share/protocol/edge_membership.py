@@ -1,0 +1,177 @@
+"""Who takes part in a room: hellos, welcomes and refusals, runs that come back, fall silent, leave."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+from share.config import Config
+from share.event_kinds import EventKind
+from share.mapping.corrections import MapEvent
+from share.mapping.map_changes import RemoveRun, SaveCredential
+from share.protocol import edge_events as ed
+from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
+from share.protocol.edge_records import EdgeOutput
+from share.protocol.peer import Peer, RestoredRun
+from share.scheduling.rate_scheduler import RateScheduler
+from share.scheduling.room_budget import RateGrant
+from share.timing import seconds_to_ns
+from share.wire import messages as wire
+from share.wire.codec import WIRE_VERSION
+
+
+class RoomMembership:
+    """The runs of a room and their presence. Effects go to `_out`."""
+
+    tracks_agents: ClassVar[bool] = False  # True where agents stream frames: `remote_tracking`
+
+    def __init__(
+        self,
+        config: Config,
+        session: int,
+        has_store: bool,
+        restored: Sequence[RestoredRun],
+        began_ns: int | None,
+    ) -> None:
+        """See `share.protocol.edge.Edge`."""
+        self._config, self._session, self._registry = config, session, RunRegistry()
+        self._out = EdgeOutput(self._registry, has_store, began_ns)
+        self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
+        self._admission = Admission(config.edge, self.tracks_agents)
+        for run in restored:
+            self._registry.restore(run)
+
+    def _on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> None:
+        """Welcome a new or known run, or refuse it. No answer while the name's present run may be dead: the
+        agent repeats its hello."""
+        if (reason := self._objection(event, hello)) is not None:
+            if not self._admission.is_name_stale(hello.name, self._registry, self._out.now_ns):
+                self._refuse(event.peer_id, reason)
+            return
+        self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
+
+    def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
+        return self._admission.objection(event, hello, self._registry, self._out.now_ns)
+
+    def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
+        """Return the new run of an admitted hello."""
+        if (idle := self._registry.oldest_idle()) is not None:
+            self._forget(idle)
+        self._admission.record_join(event, hello, self._out.now_ns)
+        self._supersede(hello.name)
+        key = new_run_key(hello, self._registry.by_key)
+        peer = Peer(event.peer_id, hello, key, self._out.now_ns, credential=event.credential)
+        self._registry.add(peer)
+        self._out.add(ed.AddRun(peer.key, peer.hello, event.credential))
+        self._rate_scheduler.begin_run(peer.name)
+        self._out.record("agent joined", peer, f"{hello.kind} '{hello.name}'")
+        return peer
+
+    def _refuse(self, peer_id: bytes, reason: str, version: int = WIRE_VERSION) -> None:
+        self._out.send(peer_id, wire.Refused(reason), version)
+        self._registry.sender(peer_id).refusals.add(reason, self._out.now_ns)
+        self._out.record("refused", None, reason)
+
+    def _welcome(self, peer: Peer) -> None:
+        """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
+        peer.is_welcomed = True
+        self._out.send(peer.id, wire.Welcome(self._session, peer.durable_below))
+        peer.grant = None
+        self._send_grant(peer, self._rate_scheduler.first_grant(peer.name, peer.hello.kind))
+        if peer.last_finding is not None:
+            self._send_correction(peer, peer.last_finding, is_repeat=True)
+
+    def _comes_back(self, peer: Peer, message: wire.Message) -> bool:
+        """Return whether a run that left is present again by this message."""
+        if isinstance(message, wire.Bye):  # repeated or late
+            return False
+        if (reason := self._capacity_objection(peer)) is not None:
+            if isinstance(message, wire.Hello | wire.Ping):  # keyframes are not answered one by one
+                self._refuse(peer.id, reason)
+            else:
+                peer.refusals.add(reason, self._out.now_ns)
+            return False
+        self._readmit(peer)
+        return True
+
+    def _capacity_objection(self, peer: Peer) -> str | None:
+        """Return why a run that left may not come back; None if it may."""
+        return self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
+
+    def _readmit(self, peer: Peer) -> None:
+        self._supersede(peer.name)
+        self._registry.mark_present(peer)
+        self._out.add(ed.SetPresence(peer.key, True))
+        self._out.record("reconnected", peer, "sends again")
+
+    def _supersede(self, name: str) -> None:
+        """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""
+        for other in self._registry.present():
+            if other.name == name:
+                self._mark_gone(other, "silent", "name taken by a newer run")
+
+    def _check_silence(self) -> None:
+        limit_s = self._config.edge.silent_s
+        for peer in self._registry.present():
+            if self._out.now_ns - peer.last_received_ns > seconds_to_ns(limit_s):
+                self._mark_gone(peer, "silent", f"no message for {limit_s:g} s")
+
+    def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
+        self._registry.mark_gone(peer)
+        peer.reorder_buffer.clear()
+        self._out.add(ed.SetPresence(peer.key, False))
+        self._out.record(event, peer, reason)
+
+    def _forget_empty_runs(self) -> None:
+        for peer in self._registry.removable():
+            self._forget(peer)
+            self._out.save(RemoveRun(peer.key))
+            self._out.record("forgotten", peer, f"the map has nothing left of run {peer.key}")
+
+    def _forget(self, peer: Peer) -> None:
+        """Remove a run and its state for good."""
+        if self._registry.forget(peer):  # it was the latest of its name
+            self._rate_scheduler.forget(peer.name)
+        self._out.add(ed.DropRun(peer.key))
+
+    def _may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
+        """Return whether a known run may send: its credential allows it, and it is present or comes back."""
+        if not event.is_authorised_for(peer.name):
+            self._count_bad_message(None, f"a key that is not authorized for '{peer.name}' used its run")
+            if isinstance(message, wire.Hello):  # only a hello is answered
+                reason = name_objection(peer.name, event.allowed_names or ())
+                self._out.send(event.peer_id, wire.Refused(reason))
+                self._out.record("refused", None, reason)
+            return False
+        if peer.is_gone and not self._comes_back(peer, message):
+            return False
+        peer.mark_received(self._out.now_ns)
+        if peer.credential != event.credential:  # it has changed, or was unknown
+            peer.credential = event.credential
+            self._out.add(ed.SetCredential(peer.key, event.credential))
+            if peer.odometry_base is not None:
+                self._out.save(SaveCredential(peer.key, event.credential))
+        return True
+
+    def _send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
+        """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
+        assert finding.correction is not None
+        peer.revision += 1
+        peer.counts["corrections"] += 1
+        correction = replace(finding.correction, revision=peer.revision)
+        peer.computation.answer(correction.answered_keyframe, self._out.now_ns)
+        self._out.send(peer.id, correction)
+        answered = {"revision": peer.revision, "answers": correction.answered_keyframe}
+        self._out.record(finding.event, peer, finding.reason, is_repeat, map_id=correction.map_id, **answered)
+
+    def _send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
+        """Send what an agent may send, if that has changed; None: everything, which needs no message."""
+        if grant is not None and grant != peer.grant:
+            self._out.send(peer.id, wire.Rate(grant.hz, self._rate_scheduler.is_windowed, grant.pose_hz))
+            peer.grant = grant
+
+    def _count_bad_message(self, peer: Peer | None, reason: str) -> None:
+        """Count a bad message; record the first of each peer."""
+        if (peer or self._registry.unjoined).count("bad_messages", reason, self._out.now_ns) == 1:
+            self._out.record("bad message", peer, reason, throttled=False)
