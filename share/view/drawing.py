@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from share.colours import Colour
 from share.types import F32, F64, AgentKind
-
-Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from share.colours import Colour, agent_colour
 from share.mapping.loops import KeyframeKey
 from share.types import F64
 from share.view import drawing as dr
@@ -22,10 +23,6 @@ from share.view.agent_paths import PlacedKeyframe, RunPath
 from share.view.loop_lines import LoopLines
 from share.view.shapes import frusta, lines, named, shifted
 
-COLOURS: tuple[dr.Colour, ...] = (  # of agents, told apart also by those who see few colours (Okabe and Ito)
-    *((86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66)),
-    *((213, 94, 0), (204, 121, 167), (0, 114, 178), (190, 190, 190)),
-)
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
 _MAP_SPACING_M = 10.0  # between maps that are not joined
 _MAX_CHUNKS = 12  # drawn at a time
@@ -282,10 +279,10 @@ class Room:
         place = None if (run := self.runs.get(run_key)) is None else run.place()
         return None if place is None else shifted(place[1], self._offset(place[0]))
 
-    def colour(self, run: RunPath) -> dr.Colour:
+    def colour(self, run: RunPath) -> Colour:
         """Return the colour of an agent: that of its first run."""
         names = list(dict.fromkeys(other.shown.name for other in self.runs.values()))
-        return COLOURS[names.index(run.shown.name) % len(COLOURS)]
+        return agent_colour(names.index(run.shown.name))
 
     def _draw_body(self, run: RunPath) -> dr.Body | None:
         if (place := run.place()) is None:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from share.colours import Colour
 from share.errors import DataError
 from share.geometry.se3 import quat_from_matrix
 from share.net.http_guard import HttpGuard
@@ -47,7 +48,7 @@ class Window:
         self._panel = self._server.gui.add_html("")
         self._panel_html = ""
         self._frames: dict[str, Any] = {}  # nodes of bodies by name, with the colour that they were drawn in
-        self._colours: dict[str, tuple[dr.Colour, str]] = {}
+        self._colours: dict[str, tuple[Colour, str]] = {}
         self._cameras: dict[int, _BrowserCamera] = {}
         self._followed: tuple[str, ...] = ()
         self._floor: dr.FloorGrid | None = None
@@ -124,7 +125,7 @@ class Window:
         )
         camera.position, camera.wxyz = body.T_room_body[:3, 3], _wxyz(body.T_room_body[:3, :3])
 
-    def _make_body(self, body: dr.Body, colour: dr.Colour) -> None:
+    def _make_body(self, body: dr.Body, colour: Colour) -> None:
         scene, name = self._server.scene, body.name
         self._colours[name] = colour, body.label
         scene.add_frame(name, show_axes=False)

@@ -70,7 +70,7 @@ def _draw_ratios(folder: Path, runs: Sequence[RunMetrics], names: Sequence[str],
     }
     if not compared:
         return ""
-    draw_ratios(folder / "parts.png", compared, base, names)
+    draw_ratios(folder / "parts.png", compared, base)
     return _image_links({f"Each policy's ratio to {base}; whiskers: 95 % confidence": "parts.png"})
 
 
