@@ -104,8 +104,8 @@ def ablation(
     """Play SESSIONS with each policy and each seed, and compare the policies.
 
     The policies take turns on each session, so that a slower machine affects all alike. DIR gets a folder
-    per run, report.html (opens offline), report.md, agents.csv, runs.csv and pictures. An interrupted command
-    continues when it is run again.
+    per run, report.html (opens offline), report.md, agents.csv, runs.csv, table.tex and pictures. An
+    interrupted command continues when it is run again.
 
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
@@ -124,7 +124,7 @@ def ablation(
     planned_runs = plan_policies(
         opened, policies, range(seeds), RunOptions("", **options_given), out / "runs", config
     )
-    writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
+    writable_dir(out, "agents.csv", "runs.csv", "table.tex", "report.md", "report.html")
     trials_by_folder = play_runs(planned_runs, worker_pool(workers), lambda one: one.out.name)
     trials = list(trials_by_folder.values())
     failed = [one.out.name for one in planned_runs if one.out not in trials_by_folder]
@@ -137,7 +137,8 @@ def _write_ablation_report(
     out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection]
 ) -> None:
     from share.files.writing import atomic_write
-    from share.lab.evaluate.report import agents_csv, html_page, markdown, runs_csv
+    from share.lab.evaluate.policy_report import latex_table, markdown
+    from share.lab.evaluate.report import agents_csv, html_page, runs_csv
     from share.lab.evaluate.report_charts import draw_report
     from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.statistics import policy_names
@@ -154,10 +155,11 @@ def _write_ablation_report(
         atomic_write(out / name, read_picture(path))
     atomic_write(out / "agents.csv", agents_csv(all_metrics))
     atomic_write(out / "runs.csv", runs_csv(all_metrics))
+    atomic_write(out / "table.tex", latex_table(all_metrics, base))
     atomic_write(out / "report.md", report)
     atomic_write(out / "report.html", html_page("Policies compared", report, out))
     click.echo(markdown(all_metrics, trials, base, failed))
-    click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")
+    click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv, *.tex")
 
 
 _HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges per metre", "AR QoE")
