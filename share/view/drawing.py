@@ -30,6 +30,15 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
+class Marks:
+    """Marks at positions (N, 3), m, that can be clicked."""
+
+    name: str
+    positions: F64
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
 class Body:
     """An agent: T_room_body (4, 4). half_angles: as in `RunShown`. is_current: its pose is current."""
 
@@ -84,4 +93,4 @@ class Announcement:
     text: str
 
 
-Drawing = Points | Lines | Body | Picture | Text | FloorGrid | Removed | Announcement
+Drawing = Points | Lines | Marks | Body | Picture | Text | FloorGrid | Removed | Announcement
