@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +56,7 @@ class _Seconds(click.FloatRange):
     help="Play covins-g, then share (or --policy), on the same recordings; show both side by side. Takes "
     "twice as long, without a browser, which would take the same cores.",
 )
+@options.as_json
 def demo(
     seconds: float,
     policy: str | None,
@@ -66,6 +68,7 @@ def demo(
     seed: int | None,
     view: bool,
     is_compared: bool,
+    as_json: bool,
 ) -> None:
     """Try the whole system on this machine; nothing else is needed.
 
@@ -102,7 +105,7 @@ def demo(
         session = read_session(make_cached_session(demo_recipe(room, seconds, seed), progress=stages))
     if is_compared:
         terms = RunOptions(policy, link, seed, true_error, agents_first=True)
-        _compare(session, terms, config, out)
+        _compare(session, terms, config, out, as_json)
         return
     screen = RunScreen(view)
     run_terms = RunOptions(
@@ -117,6 +120,10 @@ def demo(
     screen.end()
     result = score_session(session, folders)
     since_s = join_times(out / "edge" / "events.jsonl")
+    picture = _draw_paths(out, result)
+    if as_json:
+        click.echo(json.dumps(_document(policy, result, since_s)))
+        return
     click.echo(_score_table(result, since_s, policy == STREAMED))
     if core_count() <= len(folders):
         warning = (
@@ -124,20 +131,52 @@ def demo(
             "machines they would not"
         )
         click.echo(warning)
-    picture = out / "trajectories.png"
-    picture.unlink(missing_ok=True)  # left by an earlier demo
-    if result.joint is not None:
-        from share.lab.evaluate.charts import draw_trajectories
-
-        title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
-        paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
-        draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
+    if picture is not None:
         click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
 
 
-def _compare(session: Session, terms: RunOptions, config: Config, out: Path) -> None:
+def _draw_paths(out: Path, result: SessionScore) -> Path | None:
+    """Draw the paths of a run in which agents share a map; return the picture."""
+    picture = out / "trajectories.png"
+    picture.unlink(missing_ok=True)  # left by an earlier demo
+    if result.joint is None:
+        return None
+    from share.lab.evaluate.charts import draw_trajectories
+
+    title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
+    paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
+    draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
+    return picture
+
+
+def _document(policy: str, result: SessionScore, since_s: Mapping[str, float]) -> dict[str, Any]:
+    """Return the result as plain data."""
+    joint = {} if result.joint is None else result.joint.agents
+
+    def rmse_cm(ate: Ate | None) -> float | None:
+        return None if ate is None else 100 * ate.rmse
+
+    agents = {
+        name: {
+            "odom_ate_cm": rmse_cm(agent.odometry),
+            "map_ate_cm": rmse_cm(joint.get(name)),
+            "shared_map_s": since_s.get(name),
+            "report": agent.report,
+        }
+        for name, agent in result.agents.items()
+    }
+    return {
+        "policy": policy,
+        "joint_ate_cm": rmse_cm(None if result.joint is None else result.joint.joint),
+        "agents": agents,
+    }
+
+
+def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_json: bool) -> None:
     """Play a session by the base policy and by that of `terms`; show both."""
     from share.cli.terminal import aligned_table
+    from share.devices.host import core_count
+    from share.files.json_file import nan_to_none
     from share.lab.evaluate.side_by_side import ScoredTrial, comparison_rows, draw_side_by_side, headline
     from share.lab.evaluate.trial import run_trial
 
@@ -153,8 +192,18 @@ def _compare(session: Session, terms: RunOptions, config: Config, out: Path) -> 
         live.end()
     picture = out / "compared.png"
     draw_side_by_side(picture, scored)
+    if as_json:
+        runs_of = {one.policy: nan_to_none(asdict(one.metrics)) for one in scored}
+        click.echo(json.dumps({"headline": headline(scored), "runs": runs_of, "picture": str(picture)}))
+        return
     click.echo(aligned_table(comparison_rows(scored)))
     runs = ", ".join(str(one.trial.folder) for one in scored)
+    loads, cores = [one.trial.record["machine"]["load"] for one in scored], core_count()
+    if max(loads) > 0.5 * cores:
+        click.echo(
+            f"\nother programs kept this machine busy ({cores} cores; load before each run "
+            f"{', '.join(f'{load:g}' for load in loads)}): latencies are not the policies'; repeat it when idle"
+        )
     click.echo(f"\n{headline(scored)}\n\npicture: {picture}   runs: {runs}")
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from share.files.json_file import nan_to_none
 from share.lab.evaluate.report import format_number, markdown_table, provenance
 from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.statistics import (
@@ -175,6 +176,23 @@ def agent_mean(runs: Sequence[RunMetrics], policy: str, session: str, agent: str
     ]
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else math.nan
+
+
+def comparison_document(runs: Sequence[RunMetrics], base: str) -> dict[str, Any]:
+    """Return the values and ratios of all policies as plain data."""
+    policies = {
+        name: {
+            one.measure.name: {
+                "unit": one.measure.unit,
+                "value": nan_to_none(one.value._asdict()),
+                "ratio": nan_to_none(one.ratio._asdict()),
+                "pairs": one.pairs,
+            }
+            for one in compare_policies(runs, name, base)
+        }
+        for name in policy_names(runs)
+    }
+    return {"base": base, "runs": len(runs), "policies": policies}
 
 
 # LaTeX

@@ -101,7 +101,7 @@ def _ratio(values: Sequence[float]) -> str:
 def draw_side_by_side(path: Path, scored: Sequence[ScoredTrial]) -> None:
     """Write a PNG: how late poses of headsets are, merges over distance, errors over time."""
     pyplot = agg_pyplot()
-    figure, (late, merged, wrong) = pyplot.subplots(1, 3, figsize=(15, 5), layout="constrained")
+    figure, (late, merged, wrong) = pyplot.subplots(1, 3, figsize=(15, 5.4), layout="constrained")
     colours = series_colours(one.policy for one in scored)
     for one in scored:
         colour = colours[one.policy]
@@ -138,7 +138,7 @@ def draw_side_by_side(path: Path, scored: Sequence[ScoredTrial]) -> None:
     for axis in (late, merged, wrong):
         axis.grid(alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
-            axis.legend(fontsize=9)
+            axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
     figure.suptitle(headline(scored))
     save_png(figure, path, 110)
 
