@@ -198,12 +198,10 @@ def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_
         return
     click.echo(aligned_table(comparison_rows(scored)))
     runs = ", ".join(str(one.trial.folder) for one in scored)
-    loads, cores = [one.trial.record["machine"]["load"] for one in scored], core_count()
-    if max(loads) > 0.5 * cores:
-        click.echo(
-            f"\nother programs kept this machine busy ({cores} cores; load before each run "
-            f"{', '.join(f'{load:g}' for load in loads)}): latencies are not the policies'; repeat it when idle"
-        )
+    load, cores = scored[0].trial.record["machine"]["load"], core_count()
+    if load > 0.5 * cores:
+        busy = f"other programs kept this machine busy (load {load:g} on {cores} cores before the first run)"
+        click.echo(f"\n{busy}: latencies are not those of the policies; repeat it when idle")
     click.echo(f"\n{headline(scored)}\n\npicture: {picture}   runs: {runs}")
 
 
