@@ -59,7 +59,7 @@ def is_near(loop: Loop) -> bool:
 
 
 def weigh_loops(loops: Sequence[Loop], graph: MapGraph, sides: Mapping[int, int]) -> LoopEvidence:
-    """Weigh `loops`. sides: on which side of the loops each segment is; segments of one side are in one frame.
+    """Weigh `loops`. sides: side of the loops on which each segment is; segments of one side share a frame.
 
     Places are counted on each side, the least counts; loops of distant views are ignored."""
     near_loops = [loop for loop in loops if is_near(loop)]
