@@ -206,9 +206,10 @@ class InertialTracker:
         if len(state.feature_ids) < WEAK:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
         self._adopt_state(landmarks, new_segment=T_odom_cam is None)
-        if self._mono_window is not None or not self._is_publishable(state):
-            return self._waiting_result(state)
-        return self._publish(frame, landmarks, TrackState.OK, True, len(state.feature_ids))
+        count = len(state.feature_ids)
+        if self._mono_window is not None or not self._is_publishable(state, count):
+            return self._waiting_result(state, count)
+        return self._publish(frame, landmarks, TrackState.OK, True, count)
 
     def _relocalise(self, frame: Frame) -> F64 | None:
         """Return T_odom_cam (4, 4) of a LOST frame by its ORB features; None if it is not found."""
@@ -273,7 +274,7 @@ class InertialTracker:
         wants_keyframe = is_textured and self._keyframes.wants_keyframe(frame.stamp_ns, s.T, count)
         if state is TrackState.INITIALISING:
             if not self._advance_mono_window(frame, landmarks, wants_keyframe):
-                return self._waiting_result(s)
+                return self._waiting_result(s, count)
             state, wants_keyframe = TrackState.OK, True
         result = self._publish(frame, landmarks, state, wants_keyframe, count)
         found_count = int((matches.is_found | inliers).sum())
@@ -349,25 +350,26 @@ class InertialTracker:
     def _track_state(self, s: FilterState, count: int, imu: ImuUse) -> TrackState:
         has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)
         if self._mono_window is not None or (
-            has_imu and not self._has_published and not self._is_publishable(s)
+            has_imu and not self._has_published and not self._is_publishable(s, count)
         ):
             return TrackState.INITIALISING
         return pose_state(count, has_imu)
 
-    def _is_publishable(self, s: FilterState) -> bool:
-        """Return whether a first pose can be published. The velocity must not rest on dynamic features
-        alone."""
+    def _is_publishable(self, s: FilterState, count: int) -> bool:
+        """Return whether a first pose can be published, of a frame with `count` features in use. The velocity
+        must rest on static features."""
         waited_s = (s.stamp_ns - self._start_ns) * 1e-9
-        return self._is_static() and initialisation.is_publishable(s, waited_s, self._new_segment)
+        return self._sees_the_room(count) and initialisation.is_publishable(s, waited_s, self._new_segment)
 
-    def _is_static(self) -> bool:
-        return self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
+    def _sees_the_room(self, count: int) -> bool:
+        is_static = self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
+        return is_static and count >= BLIND
 
-    def _waiting_result(self, s: FilterState) -> TrackResult:
+    def _waiting_result(self, s: FilterState, count: int) -> TrackResult:
         if self._mono_window is not None:
             reason = WaitReason.SCALE
         else:
-            reason = initialisation.waiting_for(s) if self._is_static() else WaitReason.VIEW
+            reason = initialisation.waiting_for(s) if self._sees_the_room(count) else WaitReason.VIEW
         return TrackResult(TrackState.INITIALISING, None, waiting_for=reason)
 
     def _published_pose(self, s: FilterState) -> F64:
