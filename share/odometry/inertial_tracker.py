@@ -32,7 +32,7 @@ from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
 from share.odometry.relocalisation import LocalMap
 from share.odometry.rest_detection import RestDetector
-from share.odometry.state import FilterState, twist
+from share.odometry.state import FilterState, move, twist
 from share.odometry.tilt_realignment import TiltRealignment
 from share.odometry.track_result import TrackResult, finite_median
 from share.types import (
@@ -79,12 +79,13 @@ class InertialTracker:
         self._divergence = DivergenceMonitor()
         self._consistency = ImageImuConsistency()
         self._imu_wait_frames = 0  # without an IMU sample
-        self._start_ns, self._start_position = 0, np.zeros(3)
+        self._start_ns = 0
         self._has_published = False
         self._knows_up = False  # the state began with IMU samples
         self._new_segment = False  # the next keyframe begins a segment
         self._keyframes = KeyframeScheduler(config)
         self._realignment = TiltRealignment()
+        self._start_cov = np.zeros((6, 6))  # of the pose in odom where the filter began
         self._local_map = LocalMap()  # for relocalisation
         self._tracker_config = tracker_config
         self._round_robin = relocalisation.RoundRobin()
@@ -199,7 +200,7 @@ class InertialTracker:
         if state is None:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.IMU)
         if T_odom_cam is not None:
-            state.T = T_odom_cam @ se3.inverse(self._rig.T_body_cam0)
+            move(state, T_odom_cam @ se3.inverse(self._rig.T_body_cam0))
         landmarks = LandmarkMap(state, self._rig, self._config)
         self._imu.restart(state)
         self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
@@ -243,7 +244,8 @@ class InertialTracker:
         """Track from this state on. Its pose is published once it has converged."""
         s = landmarks.state
         self._landmarks, self._has_published, self._lost_ns = landmarks, False, None
-        self._start_ns, self._start_position = s.stamp_ns, s.T[:3, 3].copy()  # by the IMU's clock
+        self._start_ns = s.stamp_ns  # by the IMU's clock
+        self._start_cov = np.zeros((6, 6)) if new_segment else relocalisation.POSE_COV
         self._mono_window = start_mono_window(s, self._rig.cam0, self._imu.noise, self._config)
         self._rest = RestDetector()
         self._new_segment = new_segment
@@ -327,10 +329,13 @@ class InertialTracker:
         is_first, self._has_published, self._mono_window = not self._has_published, True, None
         new_segment = is_first and self._new_segment
         if is_first:
-            self._realignment.start(s, self._start_position, new_segment)
+            self._realignment.start(s, new_segment)
         else:
             self._realignment.update(s)
-        pose, cov = self._published_pose(s), filter.pose_cov(s)
+        pose = self._published_pose(s)
+        cov = se3.compose_cov(
+            se3.inverse(s.T_origin) @ s.T, self._start_cov, filter.motion_cov_since_origin(s)
+        )
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)
