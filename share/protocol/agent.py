@@ -188,7 +188,7 @@ class Agent:
         if sent:
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
             self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
-            self._self_evaluation.add_keyframe(keyframe, frame, self._now_ns)
+            self._self_evaluation.add_keyframe(keyframe, frame, self._pace.next_send_ns(self._now_ns))
             self._send_evaluation(keyframe.id)
         else:
             self._counts["drop_rate"] += 1
@@ -283,6 +283,7 @@ class Agent:
             return
         was_disconnected, self._is_connected, self._silence_reported = not self._is_connected, True, False
         self._version_probe.mark_answered()
+        self._pace.hold(welcome.hold_ms, self._now_ns)
         if welcome.session != self._sessions.session:
             self._begin_session(welcome)
         elif was_disconnected:
@@ -360,6 +361,8 @@ class Agent:
             self._finish()
 
     def _send_data(self) -> None:
+        if self._pace.next_send_ns(self._now_ns) > self._now_ns:
+            return
         for entry in self._ledger.take_due(self._now_ns, self._pace.window):
             self._send_frames(encode(entry.keyframe), entry.keyframe.id)
 

@@ -62,6 +62,7 @@ class Edge:
         self._event_log, self._version_throttle = EventLog(began_ns), Throttle(_VERSION_REFUSAL_HZ, 1.0)
         self._durability, self._internal_errors = DurabilityTracker(has_store), 0
         self._effects: list[ed.EdgeEffect] = []
+        self._full_reason: str | None = None  # why nobody, or no robot, can join
         self._now_ns = 0  # of the event that is being handled
         for run in restored:
             self._registry.restore(run)
@@ -173,6 +174,14 @@ class Edge:
         report = AgentReport(peer.hello.kind, evaluation, self._now_ns, *arrived, *service)
         t_s = self._event_log.elapsed_s(self._now_ns)
         self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
+        self._note_full_room()
+
+    def _note_full_room(self) -> None:
+        """Record that one more agent finds no room, or does again."""
+        reason = self._rate_scheduler.full_reason(self._now_ns)
+        if (reason is None) != (self._full_reason is None):
+            self._record("room full", None, reason or "there is room again")
+        self._full_reason = reason
 
     def _send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
@@ -203,7 +212,18 @@ class Edge:
         self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        return self._admission.objection(event, hello, self._registry, self._now_ns)
+        if (reason := self._admission.objection(event, hello, self._registry, self._now_ns)) is not None:
+            return reason
+        is_known = event.peer_id in self._registry
+        return None if is_known else self._rate_scheduler.objection(hello.name, hello.kind, self._now_ns)
+
+    def _make_room(self, peer: Peer) -> None:
+        """Send away who has to leave for a run that has joined."""
+        for name in self._rate_scheduler.displaced(peer.name, peer.hello.kind, self._now_ns):
+            for other in self._registry.values():
+                if other.name == name and not other.is_gone:
+                    self._refuse(other.id, f"no air left beside headsets: '{peer.name}' has joined")
+                    self._mark_gone(other, "left", f"made room for '{peer.name}'")
 
     def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
         """Return the new run of an admitted hello."""
@@ -217,6 +237,7 @@ class Edge:
         self._effects.append(ed.AddRun(peer.key, peer.hello, event.credential))
         self._rate_scheduler.begin_run(peer.name)
         self._record("agent joined", peer, f"{hello.kind} '{hello.name}'")
+        self._make_room(peer)
         return peer
 
     def _refuse(self, peer_id: bytes, reason: str, version: int = WIRE_VERSION) -> None:
@@ -226,8 +247,8 @@ class Edge:
 
     def _welcome(self, peer: Peer) -> None:
         """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
-        peer.is_welcomed = True
-        self._send(peer.id, wire.Welcome(self._session, peer.durable_below))
+        peer.is_welcomed, hold_ms = True, self._rate_scheduler.hold_ms(self._now_ns)
+        self._send(peer.id, wire.Welcome(self._session, peer.durable_below, hold_ms))
         peer.grant = None
         self._send_grant(peer, self._rate_scheduler.first_grant(peer.name, peer.hello.kind))
         if peer.last_finding is not None:
@@ -248,7 +269,8 @@ class Edge:
 
     def _capacity_objection(self, peer: Peer) -> str | None:
         """Return why a run that left may not come back; None if it may."""
-        return self._admission.capacity_objection(peer.hello, self._registry, self._now_ns)
+        full = self._admission.capacity_objection(peer.hello, self._registry, self._now_ns)
+        return full or self._rate_scheduler.objection(peer.name, peer.hello.kind, self._now_ns)
 
     def _readmit(self, peer: Peer) -> None:
         self._supersede(peer.name)
@@ -256,6 +278,7 @@ class Edge:
         self._registry.make_latest(peer)
         self._effects.append(ed.SetPresence(peer.key, True))
         self._record("reconnected", peer, "sends again")
+        self._make_room(peer)
 
     def _supersede(self, name: str) -> None:
         """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""
@@ -406,7 +429,10 @@ class Edge:
                 for peer in peers
             },
             "unjoined": dict(self._unjoined.counts),
-            "refused": fault_warnings(peers, self._unjoined, self._now_ns),
+            "refused": [
+                *filter(None, [self._rate_scheduler.full_reason(self._now_ns)]),
+                *fault_warnings(peers, self._unjoined, self._now_ns),
+            ],
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,
             "version": __version__,

@@ -22,7 +22,8 @@ import numpy as np
 from share.config import ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
-from share.scheduling.room_budget import RateGrant, RoomController, first_grant
+from share.scheduling.room_budget import RateGrant, first_grant
+from share.scheduling.room_controller import RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -102,6 +103,18 @@ class Policy:
     def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
         """Return what an agent that joins may send until its first evaluation; None: everything."""
         return None
+
+    def hold_ms(self, now_ns: int) -> float:
+        """Return how long an agent that joins now holds its keyframes, ms."""
+        return 0.0
+
+    def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
+        """Return why the room cannot serve one more agent, for a person; None if it can."""
+        return None
+
+    def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
+        """Return who has to leave for an agent that joins, by name."""
+        return ()
 
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         """Return what the agent may send from now on; None: everything."""
@@ -186,6 +199,15 @@ class SharePolicy(Policy):
         """Slow start, until the room knows how the agent is served."""
         return first_grant(self._qoe_parameters(agent, kind).form)
 
+    def hold_ms(self, now_ns: int) -> float:
+        return self._room.hold_ms(now_ns)
+
+    def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
+        return self._room.objection(self._qoe_parameters(agent, kind).form, now_ns)
+
+    def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
+        return self._room.displaced(self._qoe_parameters(agent, kind).form, now_ns)
+
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         evaluation = report.evaluation
         hz = self.rate(agent, report.kind, evaluation.delay_ms, evaluation.error_cm, report.now_ns)
@@ -234,6 +256,9 @@ class SharePaperPolicy(SharePolicy):
 
     def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
         return None
+
+    def hold_ms(self, now_ns: int) -> float:
+        return 0.0
 
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         evaluation = report.evaluation

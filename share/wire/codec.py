@@ -315,7 +315,7 @@ _LAYOUTS: dict[type, _Layout] = {
         unacknowledged_ms=float,
         clock_error_ms=float | None,
     ),
-    m.Welcome: _Layout(16, m.Welcome, session=Int64, next_keyframe=Int64),
+    m.Welcome: _Layout(16, m.Welcome, session=Int64, next_keyframe=Int64, hold_ms=float),
     m.Refused: _Layout(17, m.Refused, reason=Text),
     m.Ack: _Layout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
     Correction: _Layout(
