@@ -247,10 +247,10 @@ class Edge:
 
     def _welcome(self, peer: Peer) -> None:
         """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
-        peer.is_welcomed, hold_ms = True, self._rate_scheduler.hold_ms(self._now_ns)
+        peer.is_welcomed, hold_ms = True, self._rate_scheduler.hold_ms(peer.name, self._now_ns)
         self._send(peer.id, wire.Welcome(self._session, peer.durable_below, hold_ms))
         peer.grant = None
-        self._send_grant(peer, self._rate_scheduler.first_grant(peer.name, peer.hello.kind))
+        self._send_grant(peer, self._rate_scheduler.first_grant(peer.name, peer.hello.kind, self._now_ns))
         if peer.last_finding is not None:
             self._send_correction(peer, peer.last_finding, is_repeat=True)
 

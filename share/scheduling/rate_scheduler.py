@@ -51,13 +51,13 @@ class RateScheduler:
         self.begin_run(agent)
         self._history.pop(agent, None)
 
-    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
         """Return what an agent that joins may send; None: everything."""
-        return self._policy.first_grant(agent, kind)
+        return self._policy.first_grant(agent, kind, now_ns)
 
-    def hold_ms(self, now_ns: int) -> float:
+    def hold_ms(self, agent: str, now_ns: int) -> float:
         """Return how long an agent that joins now holds its keyframes, ms."""
-        return self._policy.hold_ms(now_ns)
+        return self._policy.hold_ms(agent, now_ns)
 
     def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
         """Return why the room cannot serve one more agent, for a person; None if it can."""

@@ -118,9 +118,9 @@ class RoomBudget:
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
-def first_grant(form: AgentKind) -> RateGrant:
-    """Return what an agent may send until its air is known."""
-    return scarce_grant(form, SLOW_START_HZ)
+def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
+    """Return what an agent may send until its air is known, if there are `hz` for it."""
+    return scarce_grant(form, min(SLOW_START_HZ, max(LEAST_HZ[form], hz)))
 
 
 def scarce_grant(form: AgentKind, hz: float) -> RateGrant:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from share.scheduling.qoe import QoeParameters
 from share.scheduling.room_budget import SILENT_S, AgentAir, RateGrant, RoomBudget, first_grant
 from share.scheduling.room_capacity import RoomCapacity
-from share.scheduling.staggered_start import StaggeredStart
+from share.scheduling.staggered_start import UNKNOWN_KEYFRAME_S, StaggeredStart
 from share.timing import seconds_to_ns
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
+_STARTING_NS = 10_000_000_000  # who has not sent them by then takes no part from others
+_STARTING_LOAD = 0.5  # of the air, for all that begin
 
 
 class RoomController:
@@ -23,10 +25,19 @@ class RoomController:
         self._grants: dict[str, RateGrant] = {}
         self._allocated_ns = 0
         self._start = StaggeredStart()
+        self._starting: dict[str, int] = {}  # agents whose air is not known, and when they joined
         self._capacity, self._looked_ns = RoomCapacity(), 0
 
-    def hold_ms(self, now_ns: int) -> float:
+    def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
+        """Return what an agent may send whose air is not known: its part of what all that begin have."""
+        self._starting = {n: at for n, at in self._starting.items() if now_ns - at < _STARTING_NS}
+        air_s = self._budget.longest_air_s or UNKNOWN_KEYFRAME_S
+        hz = _STARTING_LOAD / (air_s * max(1, len(self._starting)))
+        return first_grant(form, hz)
+
+    def hold_ms(self, name: str, now_ns: int) -> float:
         """Return how long an agent that joins now holds its keyframes, ms."""
+        self._starting[name] = now_ns
         return self._start.hold_ms(self._budget.longest_air_s, now_ns)
 
     def grant(
@@ -58,7 +69,8 @@ class RoomController:
         self._budget = self._budget.with_report(name, reported)
         self._look_at_capacity(now_ns)
         if counts[0] < _SLOW_START_KEYFRAMES:
-            return first_grant(terms.form)
+            return self.first_grant(terms.form, now_ns)
+        self._starting.pop(name, None)
         if not self._budget.is_short:
             self._grants = {}
             return RateGrant(wanted_hz)
@@ -85,8 +97,8 @@ class RoomController:
     def forget(self, name: str) -> None:
         """Drop an agent."""
         self._budget = self._budget.without(name)
-        self._counts.pop(name, None)
-        self._grants.pop(name, None)
+        for kept in (self._counts, self._grants, self._starting):
+            kept.pop(name, None)
 
     def _rates(self, name: str, counts: tuple[int, int], now_ns: int) -> tuple[float, float]:
         """Return keyframes and poses a second since the agent's last report."""

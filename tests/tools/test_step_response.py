@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from helpers.experiments import experiment
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools" / "experiments"))
-from step_response import reversals, step_response
+module = experiment("step_response")
+reversals, step_response = module.reversals, module.step_response
 
 T_S = np.arange(0, 40, 0.5)
 
