@@ -301,7 +301,7 @@ LAYOUTS: dict[type, Layout] = {
         unacknowledged_ms=float,
         clock_error_ms=float | None,
     ),
-    m.Welcome: Layout(16, m.Welcome, session=Int64, next_keyframe=Int64),
+    m.Welcome: Layout(16, m.Welcome, session=Int64, next_keyframe=Int64, hold_ms=float),
     m.Refused: Layout(17, m.Refused, reason=Text),
     m.Ack: Layout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
     Correction: Layout(
