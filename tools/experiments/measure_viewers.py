@@ -3,9 +3,9 @@
     python tools/experiments/measure_viewers.py SESSION [--rounds N] --out DIR
 
 Plays SESSION in real time once a round and setup, in another order each round, so that whatever else the
-machine does meets all setups alike. A viewer reads all that the live room sends. Prints a Markdown table of means, and
-of differences from the setup without a live room in the same round (mean, standard error); writes
-viewers.json.
+machine does meets all setups alike. A viewer reads all that the live room sends. Prints a Markdown table of
+means, and of differences from the setup without a live room in the same round (mean, standard error);
+writes viewers.json.
 """
 
 from __future__ import annotations
