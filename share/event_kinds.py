@@ -9,6 +9,7 @@ EventKind = Literal[
     "silent",
     "reconnected",
     "refused",
+    "room full",
     "connection refused",
     "forgotten",
     "expired",

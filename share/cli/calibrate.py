@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
@@ -105,7 +106,10 @@ def target(
 @camera_options.mode
 @click.option("--depth", is_flag=True, help="Include the depth stream.")
 @options.out_folder
-def realsense(serial: str | None, profile_name: str | None, mode: str | None, depth: bool, out: Path) -> None:
+@options.as_json
+def realsense(
+    serial: str | None, profile_name: str | None, mode: str | None, depth: bool, out: Path, as_json: bool
+) -> None:
     """Write the factory calibration stored in a RealSense camera, for use with --calib.
 
     SERIAL selects the camera if several are attached. The factory does not measure IMU noise: the profile's
@@ -132,6 +136,10 @@ def realsense(serial: str | None, profile_name: str | None, mode: str | None, de
         rig, f"{provenance}; IMU noise of profile {request.profile.name}", serial_found
     ).items():
         atomic_write(out / name, text)
+    if as_json:
+        lens = {name: getattr(rig.cam0, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        click.echo(json.dumps({"serial": serial_found, "cam0": lens, "baseline_m": rig.baseline}))
+        return
     size = f"{rig.cam0.width}x{rig.cam0.height}, f {rig.cam0.fx:.1f} {rig.cam0.fy:.1f} px"
     click.echo(f"{out}: {provenance}: {size}, baseline {100 * rig.baseline:.2f} cm")
     click.echo("IMU noise: from the profile; measure it with `share calibrate imu`")

@@ -47,6 +47,11 @@ COMMANDS = {
     ),
     "evaluate ablation": ("share.cli.evaluate_many", "ablation", "Compare policies on sessions."),
     "evaluate sweep": ("share.cli.evaluate_many", "sweep", "Compare settings on sessions."),
+    "evaluate paper": (
+        "share.cli.evaluate_paper",
+        "paper",
+        "Each table and figure of the paper, beside what is measured here.",
+    ),
     "evaluate compare": ("share.cli.evaluate_compare", "compare", "Compare SHARE's tracker with others."),
     "train": ("share.cli.train", "train", "Train the model that estimates the tracking error."),
     "calibrate": (

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from share.cli import options
-from share.cli.live_pages import live_pages
+from share.cli.live_pages import RunScreen
 from share.cli.terminal import Column, LiveLine, Stages, column_table
 from share.config import STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
+    from share.config import Config
+    from share.lab.evaluate.real_time import Progress, RunOptions
     from share.lab.evaluate.scoring import SessionScore
     from share.metrics.ate import Ate
+    from share.recordings.session import Session
+
+_BASE_POLICY = "covins-g"  # that --compare compares with
 
 
 class _Seconds(click.FloatRange):
@@ -42,6 +49,14 @@ class _Seconds(click.FloatRange):
     "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
 )
 @click.option("--view/--no-view", default=True, help="Show the room live in a browser, in 3D.")
+@click.option(
+    "--compare",
+    "is_compared",
+    is_flag=True,
+    help="Play covins-g, then share (or --policy), on the same recordings; show both side by side. Takes "
+    "twice as long, without a browser, which would take the same cores.",
+)
+@options.as_json
 def demo(
     seconds: float,
     policy: str | None,
@@ -52,6 +67,8 @@ def demo(
     scene: str | None,
     seed: int | None,
     view: bool,
+    is_compared: bool,
+    as_json: bool,
 ) -> None:
     """Try the whole system on this machine; nothing else is needed.
 
@@ -61,8 +78,12 @@ def demo(
 
     \b
     Example:  share demo --seconds 30 --out /tmp/demo
+              share demo --compare
     """
-    policy = options.load_config(config_file, [policy]).edge.policy  # checked before the room is made
+    config = options.load_config(config_file, [policy])  # checked before the room is made
+    policy = config.edge.policy
+    if is_compared and policy in (_BASE_POLICY, STREAMED):
+        raise UsageError(f"--compare plays {_BASE_POLICY} and another policy; choose another than {policy}")
     if policy == STREAMED and true_error:
         raise UsageError(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
@@ -82,7 +103,11 @@ def demo(
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
         session = read_session(make_cached_session(demo_recipe(room, seconds, seed), progress=stages))
-    live = LiveLine()
+    if is_compared:
+        terms = RunOptions(policy, link, seed, true_error, agents_first=True)
+        _compare(session, terms, config, out, as_json)
+        return
+    screen = RunScreen(view)
     run_terms = RunOptions(
         policy,
         link,
@@ -91,11 +116,14 @@ def demo(
         config=None if config_file is None else str(config_file),
         agents_first=True,
     )
-    pages = live_pages(live) if view else None
-    folders = play_in_real_time(session, seconds, run_terms, out, lambda now: live.write(str(now)), pages)
-    live.end()
+    folders = play_in_real_time(session, seconds, run_terms, out, screen.show, screen.pages)
+    screen.end()
     result = score_session(session, folders)
     since_s = join_times(out / "edge" / "events.jsonl")
+    picture = _draw_paths(out, result)
+    if as_json:
+        click.echo(json.dumps(_document(policy, result, since_s)))
+        return
     click.echo(_score_table(result, since_s, policy == STREAMED))
     if core_count() <= len(folders):
         warning = (
@@ -103,15 +131,88 @@ def demo(
             "machines they would not"
         )
         click.echo(warning)
+    if picture is not None:
+        click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
+
+
+def _draw_paths(out: Path, result: SessionScore) -> Path | None:
+    """Draw the paths of a run in which agents share a map; return the picture."""
     picture = out / "trajectories.png"
     picture.unlink(missing_ok=True)  # left by an earlier demo
-    if result.joint is not None:
-        from share.lab.evaluate.charts import draw_trajectories
+    if result.joint is None:
+        return None
+    from share.lab.evaluate.charts import draw_trajectories
 
-        title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
-        paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
-        draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
-        click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
+    title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
+    paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
+    draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
+    return picture
+
+
+def _document(policy: str, result: SessionScore, since_s: Mapping[str, float]) -> dict[str, Any]:
+    """Return the result as plain data."""
+    joint = {} if result.joint is None else result.joint.agents
+
+    def rmse_cm(ate: Ate | None) -> float | None:
+        return None if ate is None else 100 * ate.rmse
+
+    agents = {
+        name: {
+            "odom_ate_cm": rmse_cm(agent.odometry),
+            "map_ate_cm": rmse_cm(joint.get(name)),
+            "shared_map_s": since_s.get(name),
+            "report": agent.report,
+        }
+        for name, agent in result.agents.items()
+    }
+    return {
+        "policy": policy,
+        "joint_ate_cm": rmse_cm(None if result.joint is None else result.joint.joint),
+        "agents": agents,
+    }
+
+
+def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_json: bool) -> None:
+    """Play a session by the base policy and by that of `terms`; show both."""
+    from share.cli.terminal import aligned_table
+    from share.devices.host import core_count
+    from share.files.json_file import nan_to_none
+    from share.lab.evaluate.side_by_side import ScoredTrial, comparison_rows, draw_side_by_side, headline
+    from share.lab.evaluate.trial import run_trial
+
+    scored, live = [], LiveLine()
+    for policy in (_BASE_POLICY, terms.policy):
+        played, folder = replace(terms, policy=policy), out / policy
+        _remove_trial(folder)
+
+        def show(now: Progress, policy: str = policy) -> None:
+            live.write(f"{policy}: {now}")
+
+        scored.append(ScoredTrial.of(run_trial(session, played, config, folder, show)))
+        live.end()
+    picture = out / "compared.png"
+    draw_side_by_side(picture, scored)
+    if as_json:
+        runs_of = {one.policy: nan_to_none(asdict(one.metrics)) for one in scored}
+        click.echo(json.dumps({"headline": headline(scored), "runs": runs_of, "picture": str(picture)}))
+        return
+    click.echo(aligned_table(comparison_rows(scored)))
+    runs = ", ".join(str(one.trial.folder) for one in scored)
+    load, cores = scored[0].trial.record["machine"]["load"], core_count()
+    if load > 0.5 * cores:
+        busy = f"other programs kept this machine busy (load {load:g} on {cores} cores before the first run)"
+        click.echo(f"\n{busy}: latencies are not those of the policies; repeat it when idle")
+    click.echo(f"\n{headline(scored)}\n\npicture: {picture}   runs: {runs}")
+
+
+def _remove_trial(folder: Path) -> None:
+    """Remove the run of an earlier demo; other folders are left to the error that names them."""
+    import shutil
+
+    from share.lab.evaluate.trial import RUN_FILE
+
+    if (folder / RUN_FILE).is_file():
+        shutil.rmtree(folder)
 
 
 def _renderable_scene(scene: str | None) -> str:

@@ -176,6 +176,7 @@ _SHOWN_EVENTS: set[EventKind] = {  # without -v
     "silent",
     "expired",
     "refused",
+    "room full",
     "connection refused",
     "maps merged",
     "merge undone",

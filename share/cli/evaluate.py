@@ -13,8 +13,8 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
-from share.cli.live_pages import live_pages
-from share.cli.terminal import Column, LiveLine, column_table
+from share.cli.live_pages import RunScreen
+from share.cli.terminal import Column, column_table
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -70,12 +70,12 @@ def run(
 
     if view and options_given["virtual"]:
         raise UsageError("--view shows a run in real time; leave it or --virtual out")
-    opened, live = read_session(session), LiveLine()
+    opened = read_session(session)
     config = options.load_run_config(config_file, [policy], options_given, [opened])
     run_terms = RunOptions(config.edge.policy, seed=seed, **options_given)
-    pages = live_pages(live) if view else None
-    trial = run_trial(opened, run_terms, config, out, lambda now: live.write(str(now)), pages)
-    live.end()
+    screen = RunScreen(view, may_draw=view)
+    trial = run_trial(opened, run_terms, config, out, screen.show, screen.pages)
+    screen.end()
     metrics = run_metrics(trial)
     document = {"protocol": PROTOCOL, "runs": [_run_document(metrics, trial)]}
     click.echo(json.dumps(document, default=str) if as_json else run_table(metrics))

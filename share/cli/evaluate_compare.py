@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,12 +39,14 @@ if TYPE_CHECKING:
 )
 @options.config
 @options.out_folder
+@options.as_json
 def compare(
     sources: tuple[str, ...],
     peers: tuple[str, ...],
     vocabulary: Path | None,
     config_file: Path | None,
     out: Path,
+    as_json: bool,
 ) -> None:
     """Run SHARE's tracker and others over the same recordings; compare their errors against ground truth and
     their CPU time. Each agent runs alone, without an edge.
@@ -74,7 +78,7 @@ def compare(
     jobs = [job for job in jobs if job not in unsuitable]
     rows_found, failed = _run_jobs(jobs, recordings, out)
     if rows_found:
-        _write_report(out, rows_found, missing)
+        _write_report(out, rows_found, missing, as_json)
     check_none_failed(len(jobs) - failed, len(jobs))
 
 
@@ -108,7 +112,8 @@ def _run_jobs(
     return rows_found, failed
 
 
-def _write_report(out: Path, rows_found: Sequence[TrackerRow], missing: Sequence[str]) -> None:
+def _write_report(out: Path, rows_found: Sequence[TrackerRow], missing: Sequence[str], as_json: bool) -> None:
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write
     from share.lab.evaluate.peer_comparison import draw_comparison, markdown, rows_csv
     from share.lab.evaluate.report import html_page
@@ -120,6 +125,10 @@ def _write_report(out: Path, rows_found: Sequence[TrackerRow], missing: Sequence
         out / "report.html",
         html_page("Trackers side by side", f"{text}\n{draw_comparison(out, rows_found)}", out),
     )
+    if as_json:
+        rows = [nan_to_none(asdict(row)) for row in rows_found]
+        click.echo(json.dumps({"rows": rows, "missing": list(missing)}))
+        return
     click.echo(text)
     click.echo(f"report: {out / 'report.html'}   tables: {out / 'table.md'}, {out / 'table.csv'}")
 

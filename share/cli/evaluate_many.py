@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -91,6 +92,7 @@ def check_none_failed(succeeded: int, total: int) -> None:
 )
 @options.config
 @options.out_folder
+@options.as_json
 def ablation(
     sessions: tuple[Path, ...],
     policies_given: tuple[str, ...],
@@ -99,13 +101,14 @@ def ablation(
     workers: int,
     config_file: Path | None,
     out: Path,
+    as_json: bool,
     **options_given: Any,
 ) -> None:
     """Play SESSIONS with each policy and each seed, and compare the policies.
 
     The policies take turns on each session, so that a slower machine affects all alike. DIR gets a folder
-    per run, report.html (opens offline), report.md, agents.csv, runs.csv and pictures. An interrupted command
-    continues when it is run again.
+    per run, report.html (opens offline), report.md, agents.csv, runs.csv, table.tex and pictures. An
+    interrupted command continues when it is run again.
 
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
@@ -124,20 +127,21 @@ def ablation(
     planned_runs = plan_policies(
         opened, policies, range(seeds), RunOptions("", **options_given), out / "runs", config
     )
-    writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
+    writable_dir(out, "agents.csv", "runs.csv", "table.tex", "report.md", "report.html")
     trials_by_folder = play_runs(planned_runs, worker_pool(workers), lambda one: one.out.name)
     trials = list(trials_by_folder.values())
     failed = [one.out.name for one in planned_runs if one.out not in trials_by_folder]
     if trials:
-        _write_ablation_report(out, trials, failed, sections)
+        _write_ablation_report(out, trials, failed, sections, as_json)
     check_none_failed(len(trials), len(planned_runs))
 
 
 def _write_ablation_report(
-    out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection]
+    out: Path, trials: list[Trial], failed: list[str], sections: list[ReportSection], as_json: bool
 ) -> None:
     from share.files.writing import atomic_write
-    from share.lab.evaluate.report import agents_csv, html_page, markdown, runs_csv
+    from share.lab.evaluate.policy_report import comparison_document, latex_table, markdown
+    from share.lab.evaluate.report import agents_csv, html_page, runs_csv
     from share.lab.evaluate.report_charts import draw_report
     from share.lab.evaluate.scoring import run_metrics
     from share.lab.evaluate.statistics import policy_names
@@ -154,10 +158,14 @@ def _write_ablation_report(
         atomic_write(out / name, read_picture(path))
     atomic_write(out / "agents.csv", agents_csv(all_metrics))
     atomic_write(out / "runs.csv", runs_csv(all_metrics))
+    atomic_write(out / "table.tex", latex_table(all_metrics, base))
     atomic_write(out / "report.md", report)
     atomic_write(out / "report.html", html_page("Policies compared", report, out))
+    if as_json:
+        click.echo(json.dumps({"failed": failed, **comparison_document(all_metrics, base)}))
+        return
     click.echo(markdown(all_metrics, trials, base, failed))
-    click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")
+    click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv, *.tex")
 
 
 _HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges per metre", "AR QoE")
@@ -183,6 +191,7 @@ _HEAT_MAP_MEASURES = ("AR latency", "AR ATE in the map", "merges per metre", "AR
 @click.option("--scheduler", metavar="tcp://H:P", help="Dask cluster that plays the runs (needs --virtual).")
 @options.config
 @options.out_folder
+@options.as_json
 def sweep(
     sessions: tuple[Path, ...],
     axis_texts: tuple[str, ...],
@@ -193,6 +202,7 @@ def sweep(
     scheduler: str | None,
     config_file: Path | None,
     out: Path,
+    as_json: bool,
     **options_given: Any,
 ) -> None:
     """Play SESSIONS at each point of a grid of settings, or at random points.
@@ -229,11 +239,15 @@ def sweep(
     pool = Cluster(scheduler) if scheduler else worker_pool(workers)
     trials = play_runs([one for one, _ in runs], pool, lambda one: ", ".join(point_of[one.out]))
     if trials:
-        _write_sweep_report(out, axes, [point_of[folder] for folder in trials], list(trials.values()))
+        points_played = [point_of[folder] for folder in trials]
+        _write_sweep_report(out, axes, points_played, list(trials.values()), as_json)
     check_none_failed(len(trials), len(runs))
 
 
-def _write_sweep_report(out: Path, axes: list[Axis], points: list[Point], trials: list[Trial]) -> None:
+def _write_sweep_report(
+    out: Path, axes: list[Axis], points: list[Point], trials: list[Trial], as_json: bool
+) -> None:
+    from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write
     from share.lab.evaluate.charts import draw_heat_maps
     from share.lab.evaluate.report import sweep_csv, sweep_markdown
@@ -246,7 +260,6 @@ def _write_sweep_report(out: Path, axes: list[Axis], points: list[Point], trials
     report = sweep_markdown(rows, runs, trials)
     atomic_write(out / "sweep.csv", sweep_csv(rows))
     atomic_write(out / "sweep.md", report)
-    click.echo(report)
     message = f"report: {out / 'sweep.md'}   table: {out / 'sweep.csv'}"
     if len(axes) > 1 and not any(axis.is_range for axis in axes):
         heat_maps = {
@@ -256,4 +269,10 @@ def _write_sweep_report(out: Path, axes: list[Axis], points: list[Point], trials
             out / "heat.png", heat_maps, (axes[0].name, axes[0].values), (axes[1].name, axes[1].values)
         )
         message += f"   picture: {out / 'heat.png'}"
-    click.echo(message)
+    if as_json:
+        plain = [
+            {**row, "means": {name: mean._asdict() for name, mean in row["means"].items()}} for row in rows
+        ]
+        click.echo(json.dumps({"points": nan_to_none(plain)}))
+        return
+    click.echo(f"{report}\n{message}")

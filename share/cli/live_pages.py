@@ -1,4 +1,5 @@
-"""The pages that the edge of a run serves while it plays: said, and opened where there is a screen."""
+"""What is shown of a run that plays: its edge's pages, opened where there is a screen, and the room as text
+where there is a terminal."""
 
 from __future__ import annotations
 
@@ -9,25 +10,57 @@ from typing import TYPE_CHECKING
 from share.cli.terminal import LiveLine
 
 if TYPE_CHECKING:
-    from share.lab.evaluate.real_time import Pages
+    from share.cli.terminal_room import TerminalRoom
+    from share.lab.evaluate.real_time import Pages, Progress
 
 
-def live_pages(live: LiveLine) -> Pages:
-    """Return the pages to serve. The first is opened where there is somebody to see it."""
-    from share.lab.evaluate.real_time import Pages
-    from share.view.viewer import MISSING, is_installed
+class RunScreen:
+    """Shows a run. `pages`: what its edge serves meanwhile; None: nothing.
 
-    has_view = is_installed()
-    if not has_view:
-        live.print_line(f"share: {MISSING}; there is a plain page")
-    opened = "live room" if has_view else "status"
+    has_pages: say where they are, and open the first where there is somebody to see it. may_draw: draw the
+    room as text where there is a terminal for it, else one line.
+    """
 
-    def show(line: str) -> None:
-        live.print_line(line)
-        if live.is_terminal and line.startswith(opened) and _has_screen():
-            _open_browser(line.split()[-1])
+    def __init__(self, has_pages: bool, may_draw: bool = True) -> None:
+        from share.cli.terminal_room import has_room
+        from share.lab.evaluate.real_time import Pages
+        from share.view.viewer import MISSING, is_installed
 
-    return Pages(has_view, show)
+        self._live = LiveLine()
+        self._room: TerminalRoom | None = None
+        self._merges_said = 0
+        self._is_text, self._has_pages = may_draw and has_room(self._live), has_pages
+        self._has_view = has_pages and is_installed()
+        if has_pages and not self._has_view:
+            self._live.print_line(f"share: {MISSING}; there is a plain page")
+        is_served = has_pages or self._is_text
+        self.pages: Pages | None = Pages(self._has_view, self._show_page) if is_served else None
+
+    def _show_page(self, line: str) -> None:
+        """Take an edge's line that says where a page is."""
+        from share.cli.terminal_room import TerminalRoom
+
+        address, is_status = line.split()[-1], line.startswith("status")
+        if self._is_text and is_status:
+            self._room = TerminalRoom(self._live, address)
+        if not self._has_pages:
+            return
+        self._live.print_line(line)
+        if self._live.is_terminal and is_status != self._has_view and _has_screen():
+            _open_browser(address)
+
+    def show(self, now: Progress) -> None:
+        """Show how far the run is."""
+        for line in now.merges[self._merges_said :]:
+            if self._live.is_terminal:
+                self._live.print_line(line)
+        self._merges_said = len(now.merges)
+        if self._room is None or not self._room.show(str(now)):
+            self._live.write(str(now))
+
+    def end(self) -> None:
+        """Keep what is shown last."""
+        self._live.end()
 
 
 def _has_screen() -> bool:

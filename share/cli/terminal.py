@@ -34,11 +34,23 @@ class LiveLine:
     def __init__(self) -> None:
         self._stderr = Stderr()
         self.is_terminal, self._is_open = self._stderr.is_terminal, False
+        self._block_rows = 0  # of a block that is open
 
     def write(self, text: str) -> None:
         if self.is_terminal:
             self._stderr.write("\r\x1b[K" + text[: _columns()])
             self._is_open = True
+
+    def write_block(self, lines: Sequence[str]) -> None:
+        """Write several lines, no wider than the terminal, over those of the call before."""
+        if self.is_terminal:
+            text = "\n".join(f"{line}\x1b[K" for line in lines)
+            self._stderr.write(f"{self._block_start()}{text}\x1b[J")
+            self._is_open, self._block_rows = True, len(lines)
+
+    def _block_start(self) -> str:
+        """Return what moves to the first line of an open block, or to the start of the line."""
+        return "\r" + (f"\x1b[{self._block_rows - 1}A" if self._block_rows > 1 else "")
 
     def end(self) -> None:
         """Keep the line as it is and start a new one. Waits a moment until all is written."""
@@ -46,14 +58,18 @@ class LiveLine:
         self._stderr.flush()
 
     def print_line(self, text: str) -> None:
-        """Print a line of its own on stderr, terminal or not."""
+        """Print a line of its own on stderr, terminal or not; it takes the place of an open block, which the
+        next call draws below it."""
+        if self._block_rows:
+            self._stderr.write(f"{self._block_start()}\x1b[J")
+            self._is_open, self._block_rows = False, 0
         self._break_line()
         self._stderr.print_line(text)
 
     def _break_line(self) -> None:
         if self._is_open:
             self._stderr.print_line("")
-        self._is_open = False
+        self._is_open, self._block_rows = False, 0
 
 
 def _columns() -> int | None:

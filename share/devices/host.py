@@ -49,6 +49,18 @@ def throttle_counts(root: Path = Path("/")) -> list[int]:
     return [count for path in files if (count := _read_int(path)) is not None]
 
 
+def hottest_celsius(root: Path = Path("/")) -> float | None:
+    """Return the temperature of the hottest sensor of the processor and the board."""
+    readings = [_read_int(path) for path in root.glob("sys/class/thermal/thermal_zone*/temp")]
+    return max((value / 1000 for value in readings if value is not None), default=None)
+
+
+def own_memory_bytes(proc: Path = Path("/proc")) -> int:
+    """Return the memory of this process (resident set)."""
+    pages = int((proc / "self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
 def pi_throttled_bits(root: Path = Path("/")) -> int | None:
     """Return a Raspberry Pi's supply and heat bits as `vcgencmd get_throttled`; None on other computers. A
     kernel that is not the Pi's own shows the supply alone (rpi_volt)."""

@@ -16,6 +16,7 @@ import numpy as np
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.loop_consistency import (
+    Cut,
     LoopEvidence,
     count_places,
     is_at_any,
@@ -80,6 +81,11 @@ class LoopAcceptance:
         self.ambiguous_nodes: set[int] = set()
         self._rejected_at: dict[Loop, F64] = {}  # pending loops that did not fit, and T_a_b of the map then
         self._config, self._graph, self._overlap_check = config, graph, overlap_check
+
+    @property
+    def comparison_count(self) -> int:
+        """Pairs of views compared since the start."""
+        return self._overlap_check.comparison_count
 
     def decide(self, loop: Loop) -> LoopDecision:
         """Accept a loop, keep it pending, or reject it. Raises ValueError if a keyframe is unknown."""
@@ -185,32 +191,39 @@ class LoopAcceptance:
         reason = f"{reason}; {evidence} support it"
         if evidence.places < _CONTRADICTING_PLACES:
             return LoopDecision(False, f"{reason}, {_CONTRADICTING_PLACES} places needed")
-        existing_ids = self._separating_loops(a, b)
-        existing = self._weigh_existing(existing_ids)
+        cut = self._cut(a, b)
+        existing = self._weigh_existing(cut)
         reason = f"{reason}, {existing} oppose it"
         if not evidence.outweighs(existing, _CONTRADICTING_WEIGHT):
             return LoopDecision(False, f"{reason}, more weight needed")
         if objection := self._overlap_objection(loop):
             return LoopDecision(False, reason + objection)
-        return self._replace_loops(consistent, existing_ids, reason)
+        return self._replace_loops(consistent, cut.pairs, reason)
 
     def _separating_loops(self, a: int, b: int) -> list[int]:
         """Edge ids of the fewest loops without which segments a and b are in different maps."""
+        return self._cut(a, b).pairs
+
+    def _cut(self, a: int, b: int) -> Cut:
+        """The same, as a cut of edge ids, with the segments on the side of a."""
         loops = {
             n: tuple(self._graph.segment(key) for key in (loop.a, loop.b))
             for n, loop in self._graph.edges.loops.items()
             if self._graph.reference_segment(loop.a) == self._graph.reference_segments[a]
         }
         edge_ids = list(loops)
-        return [edge_ids[i] for i in minimum_cut([(x, y) for x, y in loops.values()], a, b)]
+        cut = minimum_cut([(x, y) for x, y in loops.values()], a, b)
+        return Cut([edge_ids[i] for i in cut.pairs], cut.start_side)
 
-    def _weigh_existing(self, edge_ids: Sequence[int]) -> LoopEvidence:
-        """Weigh accepted loops by edge id, after computing the found share of a few that lack it."""
+    def _weigh_existing(self, cut: Cut) -> LoopEvidence:
+        """Weigh the accepted loops of a cut, after computing the found share of a few that lack it."""
         loops = self._graph.edges.loops
-        unchecked = [n for n in edge_ids if loops[n].found_share is None and is_near(loops[n])]
+        unchecked = [n for n in cut.pairs if loops[n].found_share is None and is_near(loops[n])]
         for n in unchecked[:: 1 + len(unchecked) // _MAX_CHECKED]:
             loops[n] = self._overlap_check.with_found_share(loops[n])
-        return self._weigh([loops[n] for n in edge_ids])
+        ends = {self._graph.segment(key) for n in cut.pairs for key in (loops[n].a, loops[n].b)}
+        sides = {segment: int(segment in cut.start_side) for segment in ends}
+        return weigh_loops([loops[n] for n in cut.pairs], self._graph, sides)
 
     def _replace_loops(self, loops: list[Loop], edge_ids: list[int], reason: str) -> LoopDecision:
         dropped = self._graph.drop_loops(edge_ids)
@@ -316,7 +329,12 @@ class LoopAcceptance:
         return None
 
     def _weigh(self, loops: Sequence[Loop]) -> LoopEvidence:
-        return weigh_loops(loops, self._graph)
+        """Weigh loops between two maps, or within a map between two segments."""
+        graph = self._graph
+        pairs = {(graph.segment(loop.a), graph.segment(loop.b)) for loop in loops}
+        maps = {s: graph.reference_segments[s] for pair in pairs for s in pair}
+        is_one_map = any(maps[a] == maps[b] for a, b in pairs)
+        return weigh_loops(loops, graph, {s: s for s in maps} if is_one_map else maps)
 
     def _weigh_unambiguous(self, loops: Sequence[Loop]) -> LoopEvidence:
         """Weigh the near loops away from places that are known to look alike."""

@@ -7,8 +7,9 @@ found share.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,18 +58,19 @@ def is_near(loop: Loop) -> bool:
     return distance_m <= NEAR_M and angle_rad <= NEAR_RAD
 
 
-def weigh_loops(loops: Sequence[Loop], graph: MapGraph) -> LoopEvidence:
-    """Weigh `loops`. Places are counted per segment, the least counts; loops of distant views are ignored."""
+def weigh_loops(loops: Sequence[Loop], graph: MapGraph, sides: Mapping[int, int]) -> LoopEvidence:
+    """Weigh `loops`. sides: side of the loops on which each segment is; segments of one side share a frame.
+
+    Places are counted on each side, the least counts; loops of distant views are ignored."""
     near_loops = [loop for loop in loops if is_near(loop)]
     if not near_loops:
         return LoopEvidence()
-    poses_by_segment: dict[int, list[F64]] = {}
+    poses_by_side: dict[int, list[F64]] = {}
     for loop in near_loops:
         for node_id in graph.loop_nodes(loop):
-            poses_by_segment.setdefault(graph.odometry.nodes[node_id].segment, []).append(
-                graph.poses[node_id]
-            )
-    count = min(count_places(np.array(poses)) for poses in poses_by_segment.values())
+            side = sides[graph.odometry.nodes[node_id].segment]
+            poses_by_side.setdefault(side, []).append(graph.poses[node_id])
+    count = min(count_places(np.array(poses)) for poses in poses_by_side.values())
     found_shares = [loop.found_share for loop in near_loops if loop.found_share is not None]
     found_share = float(np.mean(found_shares)) if found_shares else _DEFAULT_FOUND_SHARE
     keyframes = min(len({loop.a for loop in near_loops}), len({loop.b for loop in near_loops}))
@@ -103,8 +105,15 @@ def _is_one_place(T: F64, poses: F64) -> NDArray[np.bool_]:
 # Connectivity of a map: which loops, and which segments, it cannot do without.
 
 
-def minimum_cut(pairs: Sequence[tuple[int, int]], start: int, goal: int) -> list[int]:
-    """Return indices of the fewest pairs without which no path leads from `start` to `goal`.
+class Cut(NamedTuple):
+    """pairs: indices of those that are cut; start_side: what is still connected with the start."""
+
+    pairs: list[int]
+    start_side: set[int]
+
+
+def minimum_cut(pairs: Sequence[tuple[int, int]], start: int, goal: int) -> Cut:
+    """Return the fewest pairs without which no path leads from `start` to `goal`.
 
     pairs: loops, by the two segments that each connects. A minimum cut (Ford and Fulkerson 1956). Raises
     ValueError if start is goal.
@@ -127,7 +136,8 @@ def minimum_cut(pairs: Sequence[tuple[int, int]], start: int, goal: int) -> list
     residual_capacity.eliminate_zeros()
     is_reachable = np.zeros(n, bool)
     is_reachable[breadth_first_order(residual_capacity, index[start], return_predecessors=False)] = True
-    return [int(i) for i in np.flatnonzero(is_reachable[ends[:, 0]] != is_reachable[ends[:, 1]])]
+    is_cut = is_reachable[ends[:, 0]] != is_reachable[ends[:, 1]]
+    return Cut(np.flatnonzero(is_cut).tolist(), {names[i] for i in np.flatnonzero(is_reachable)})
 
 
 def articulation_segments(segment_pairs: Iterable[tuple[int, int]]) -> set[int]:

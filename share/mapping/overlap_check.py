@@ -61,9 +61,13 @@ class JoinProbation:
 
 
 class OverlapCheck:
-    """Overlap check of one graph. camera_views: by node id, as far as known."""
+    """Overlap check of one graph. camera_views: by node id, as far as known.
+
+    comparison_count: pairs of views compared since the start, 2 to 5 ms each.
+    """
 
     def __init__(self, graph: MapGraph, camera_views: Mapping[int, CameraView]) -> None:
+        self.comparison_count = 0
         self._graph, self._camera_views = graph, camera_views
         self._cache: dict[tuple[int, int], tuple[F64, MissingRegions]] = {}
         self._probations: dict[tuple[int, int], JoinProbation] = {}
@@ -150,6 +154,7 @@ class OverlapCheck:
             offset = se3.inverse(cached[0]) @ T_a_b
             if np.linalg.norm(offset[:3, 3]) < _SAME_M and se3.rotation_angle(offset) < _SAME_RAD:
                 return cached[1]
+        self.comparison_count += 1
         comparison = missing_regions(self._camera_views[b], self._camera_views[a], T_a_b)
         if len(self._cache) >= _MAX_CACHED:
             self._cache.clear()
@@ -292,9 +297,10 @@ def _expected_points(T: F64, source: CameraView, target: CameraView, reach_px: f
     inside = np.flatnonzero(_is_inside(moved, target_keypoints))
     moved = moved[inside]
     rows, cols, px = _near_keypoints(target.focal * moved[:, :2], target.focal * target_keypoints[:, :2])
-    bits = hamming_rowwise(source.view.descriptors[inside[rows]], target.view.descriptors[cols])
+    near_rows, near_cols = rows[px < reach_px], cols[px < reach_px]
+    bits = hamming_rowwise(source.view.descriptors[inside[near_rows]], target.view.descriptors[near_cols])
     is_found = np.zeros(len(inside), bool)
-    is_found[rows[(px < reach_px) & (bits <= _MAX_BITS)]] = True
+    is_found[near_rows[bits <= _MAX_BITS]] = True
     nearby_rho = np.full(len(inside), np.inf)  # least inverse depth of keypoints around
     np.fmin.at(nearby_rho, rows, target_keypoints[cols, 2])
     is_visible = nearby_rho <= _OCCLUSION_RATIO * moved[:, 2] + _OCCLUSION_RHO

@@ -11,8 +11,20 @@ from share.mapping.graph.solver import GraphSolution, PoseGraphSolver
 from share.mapping.map_solving import SolveJob
 from share.mapping.recognition.index import U32, PlaceCandidate, PlaceIndex
 from share.mapping.recognition.keyframe_views import IndexEntry
-from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_verified
-from share.mapping.recognition.verification import CameraView, Refusal, Verification, verify
+from share.mapping.recognition.patch_alignment import (
+    ImageView,
+    align_from_map,
+    align_unsure,
+    align_verified,
+)
+from share.mapping.recognition.verification import (
+    GRAVITY_DEG,
+    CameraView,
+    Refusal,
+    Verification,
+    gravity_difference_deg,
+    verify,
+)
 from share.types import F64, View
 
 
@@ -59,7 +71,7 @@ class QueryStep:
 @dataclass(frozen=True, eq=False)
 class VerifyStep:
     """Verify one candidate by its ORB features, and align the images where there are any: relative pose, or a
-    refusal."""
+    refusal. Where the features do not determine a pose, the images may."""
 
     node_id: int
     query_view: CameraView
@@ -71,9 +83,15 @@ class VerifyStep:
 
     def run(self) -> Verification | Refusal:
         verified = verify(self.query_view, self.candidate_view)
-        if isinstance(verified, Refusal) or self.query_image is None or self.candidate_image is None:
+        if self.query_image is None or self.candidate_image is None:
             return verified
-        return align_verified(verified, self.query_image, self.candidate_image)
+        if isinstance(verified, Verification):
+            return align_verified(verified, self.query_image, self.candidate_image)
+        aligned = align_unsure(verified, self.query_image, self.candidate_image)
+        if isinstance(aligned, Refusal):
+            return verified
+        turned = gravity_difference_deg(aligned.T_c_q, self.query_view, self.candidate_view)
+        return aligned if turned <= GRAVITY_DEG else verified
 
 
 @dataclass(frozen=True, eq=False)

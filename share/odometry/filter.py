@@ -25,6 +25,8 @@ from share.odometry.state import (
     EXTRINSIC,
     GYRO_BIAS,
     IMU_STATE_SIZE,
+    KEYFRAMES_START,
+    ORIGIN,
     POSE,
     TIMESHIFT,
     VELOCITY,
@@ -154,7 +156,7 @@ def innovation_covariance(
     if common_cov is not None:
         B = H_anchor @ se3.adjoint(state.T).astype(dtype)
         S += B @ common_cov.astype(dtype) @ B.T
-    poses = HP[:, CORE_SIZE : state.features_start].reshape(2 * M, -1, 6)
+    poses = HP[:, KEYFRAMES_START : state.features_start].reshape(2 * M, -1, 6)
     poses += HP[:, None, POSE]
     return HP, S
 
@@ -167,7 +169,7 @@ def needs_double_precision(state: FilterState) -> bool:
 def _relative_to_body(state: FilterState) -> F64:
     """Return the covariance with the errors of keyframe poses relative to the body's."""
     P, n = state.cov.copy(), state.size
-    poses = slice(CORE_SIZE, state.features_start)
+    poses = slice(KEYFRAMES_START, state.features_start)
     rows = P[poses].reshape(-1, 6, n)
     rows -= P[POSE]
     columns = P[:, poses].reshape(n, -1, 6)
@@ -233,7 +235,7 @@ def relinearised_rows(
 
 def jacobian_product(state: FilterState, rows: FeatureMeasurements, error: F64) -> F64:
     """Return H error (M, 2)."""
-    pose_errors = error[CORE_SIZE : state.features_start].reshape(-1, 6)[rows.anchor]
+    pose_errors = error[KEYFRAMES_START : state.features_start].reshape(-1, 6)[rows.anchor]
     from_rho = rows.H_rho * error[state.features_start + rows.feature, None]
     out: F64 = rows.H_core @ error[:CORE_SIZE] + (rows.H_anchor @ pose_errors[:, :, None])[:, :, 0] + from_rho
     return out
@@ -295,12 +297,13 @@ def _whitened_update(HP: FloatArray, S: FloatArray, residual: F64) -> tuple[F64,
 
 def correct_means(state: FilterState, error: F64) -> None:
     """Apply a correction (n,) to the means."""
-    pose_errors = error[CORE_SIZE : state.features_start].reshape(-1, 6)
-    delta = se3.exp(np.concatenate([error[POSE][None], error[EXTRINSIC][None], pose_errors]))
+    pose_errors = error[KEYFRAMES_START : state.features_start].reshape(-1, 6)
+    delta = se3.exp(np.concatenate([[error[POSE], error[EXTRINSIC], error[ORIGIN]], pose_errors]))
     rotation = delta[0, :3, :3]
     state.v = rotation @ state.v + error[VELOCITY]
     state.T = delta[0] @ state.T
-    state.keyframe_poses = delta[2:] @ state.keyframe_poses
+    state.T_origin = delta[2] @ state.T_origin
+    state.keyframe_poses = delta[3:] @ state.keyframe_poses
     state.bg, state.ba = state.bg + error[GYRO_BIAS], state.ba + error[ACCEL_BIAS]
     state.T_body_cam = state.T_body_cam @ delta[1]
     state.timeshift_s += float(error[TIMESHIFT])
@@ -335,8 +338,18 @@ def relative_poses(state: FilterState, indices: I64, b: int) -> tuple[F64, F64]:
 
 def motion_cov_since_keyframe(state: FilterState) -> F64:
     """Return the covariance (6, 6) of the body's motion since the newest keyframe, perturbed on the right."""
+    return _motion_cov_since(state, state.keyframe_columns(len(state.keyframe_ids) - 1))
+
+
+def motion_cov_since_origin(state: FilterState) -> F64:
+    """Return the covariance (6, 6) of the body's motion since the filter began, perturbed on the right. It is
+    that of its pose in a frame that keeps the tilt with which the filter began."""
+    return _motion_cov_since(state, ORIGIN) + _MIN_VARIANCE * np.eye(6)
+
+
+def _motion_cov_since(state: FilterState, columns: slice) -> F64:
     Ad = se3.adjoint(se3.inverse(state.T))
-    out: F64 = Ad @ _relative_cov(state, POSE, state.keyframe_columns(len(state.keyframe_ids) - 1)) @ Ad.T
+    out: F64 = Ad @ _relative_cov(state, POSE, columns) @ Ad.T
     return (out + out.T) / 2
 
 
@@ -361,17 +374,8 @@ def scale_sigma(state: FilterState) -> float:
     return float(np.inf) if information <= 0 else information**-0.5
 
 
-def pose_cov(state: FilterState) -> F64:
-    """Return the covariance (6, 6) of T_odom_body, perturbed on the right as in `share.geometry.se3`."""
-    return _right_perturbed_cov(state, state.T, POSE)
-
-
 def keyframe_cov(state: FilterState, k: int) -> F64:
-    """Return the covariance (6, 6) of the pose of keyframe k, perturbed on the right."""
-    return _right_perturbed_cov(state, state.keyframe_poses[k], state.keyframe_columns(k))
-
-
-def _right_perturbed_cov(state: FilterState, T: F64, columns: slice) -> F64:
-    Ad = se3.adjoint(se3.inverse(T))
+    """Return the covariance (6, 6) of the pose of keyframe k, z up, perturbed on the right."""
+    columns, Ad = state.keyframe_columns(k), se3.adjoint(se3.inverse(state.keyframe_poses[k]))
     out: F64 = Ad @ state.cov[columns, columns] @ Ad.T
     return out

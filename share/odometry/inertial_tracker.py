@@ -32,7 +32,7 @@ from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
 from share.odometry.relocalisation import LocalMap
 from share.odometry.rest_detection import RestDetector
-from share.odometry.state import FilterState, twist
+from share.odometry.state import FilterState, move, twist
 from share.odometry.tilt_realignment import TiltRealignment
 from share.odometry.track_result import TrackResult, finite_median
 from share.types import (
@@ -79,12 +79,13 @@ class InertialTracker:
         self._divergence = DivergenceMonitor()
         self._consistency = ImageImuConsistency()
         self._imu_wait_frames = 0  # without an IMU sample
-        self._start_ns, self._start_position = 0, np.zeros(3)
+        self._start_ns = 0
         self._has_published = False
         self._knows_up = False  # the state began with IMU samples
         self._new_segment = False  # the next keyframe begins a segment
         self._keyframes = KeyframeScheduler(config)
         self._realignment = TiltRealignment()
+        self._start_cov = np.zeros((6, 6))  # of the pose in odom where the filter began
         self._local_map = LocalMap()  # for relocalisation
         self._tracker_config = tracker_config
         self._round_robin = relocalisation.RoundRobin()
@@ -199,16 +200,17 @@ class InertialTracker:
         if state is None:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.IMU)
         if T_odom_cam is not None:
-            state.T = T_odom_cam @ se3.inverse(self._rig.T_body_cam0)
+            move(state, T_odom_cam @ se3.inverse(self._rig.T_body_cam0))
         landmarks = LandmarkMap(state, self._rig, self._config)
         self._imu.restart(state)
         self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
         if len(state.feature_ids) < WEAK:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
         self._adopt_state(landmarks, new_segment=T_odom_cam is None)
-        if self._mono_window is not None or not self._is_publishable(state):
-            return self._waiting_result(state)
-        return self._publish(frame, landmarks, TrackState.OK, True, len(state.feature_ids))
+        count = len(state.feature_ids)
+        if self._mono_window is not None or not self._is_publishable(state, count):
+            return self._waiting_result(state, count)
+        return self._publish(frame, landmarks, TrackState.OK, True, count)
 
     def _relocalise(self, frame: Frame) -> F64 | None:
         """Return T_odom_cam (4, 4) of a LOST frame by its ORB features; None if it is not found."""
@@ -242,7 +244,8 @@ class InertialTracker:
         """Track from this state on. Its pose is published once it has converged."""
         s = landmarks.state
         self._landmarks, self._has_published, self._lost_ns = landmarks, False, None
-        self._start_ns, self._start_position = s.stamp_ns, s.T[:3, 3].copy()  # by the IMU's clock
+        self._start_ns = s.stamp_ns  # by the IMU's clock
+        self._start_cov = np.zeros((6, 6)) if new_segment else relocalisation.POSE_COV
         self._mono_window = start_mono_window(s, self._rig.cam0, self._imu.noise, self._config)
         self._rest = RestDetector()
         self._new_segment = new_segment
@@ -273,7 +276,7 @@ class InertialTracker:
         wants_keyframe = is_textured and self._keyframes.wants_keyframe(frame.stamp_ns, s.T, count)
         if state is TrackState.INITIALISING:
             if not self._advance_mono_window(frame, landmarks, wants_keyframe):
-                return self._waiting_result(s)
+                return self._waiting_result(s, count)
             state, wants_keyframe = TrackState.OK, True
         result = self._publish(frame, landmarks, state, wants_keyframe, count)
         found_count = int((matches.is_found | inliers).sum())
@@ -326,10 +329,13 @@ class InertialTracker:
         is_first, self._has_published, self._mono_window = not self._has_published, True, None
         new_segment = is_first and self._new_segment
         if is_first:
-            self._realignment.start(s, self._start_position, new_segment)
+            self._realignment.start(s, new_segment)
         else:
             self._realignment.update(s)
-        pose, cov = self._published_pose(s), filter.pose_cov(s)
+        pose = self._published_pose(s)
+        cov = se3.compose_cov(
+            se3.inverse(s.T_origin) @ s.T, self._start_cov, filter.motion_cov_since_origin(s)
+        )
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)
@@ -349,25 +355,26 @@ class InertialTracker:
     def _track_state(self, s: FilterState, count: int, imu: ImuUse) -> TrackState:
         has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)
         if self._mono_window is not None or (
-            has_imu and not self._has_published and not self._is_publishable(s)
+            has_imu and not self._has_published and not self._is_publishable(s, count)
         ):
             return TrackState.INITIALISING
         return pose_state(count, has_imu)
 
-    def _is_publishable(self, s: FilterState) -> bool:
-        """Return whether a first pose can be published. The velocity must not rest on dynamic features
-        alone."""
+    def _is_publishable(self, s: FilterState, count: int) -> bool:
+        """Return whether a first pose can be published, of a frame with `count` features in use. The velocity
+        must rest on static features."""
         waited_s = (s.stamp_ns - self._start_ns) * 1e-9
-        return self._is_static() and initialisation.is_publishable(s, waited_s, self._new_segment)
+        return self._sees_the_room(count) and initialisation.is_publishable(s, waited_s, self._new_segment)
 
-    def _is_static(self) -> bool:
-        return self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
+    def _sees_the_room(self, count: int) -> bool:
+        is_static = self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
+        return is_static and count >= BLIND
 
-    def _waiting_result(self, s: FilterState) -> TrackResult:
+    def _waiting_result(self, s: FilterState, count: int) -> TrackResult:
         if self._mono_window is not None:
             reason = WaitReason.SCALE
         else:
-            reason = initialisation.waiting_for(s) if self._is_static() else WaitReason.VIEW
+            reason = initialisation.waiting_for(s) if self._sees_the_room(count) else WaitReason.VIEW
         return TrackResult(TrackState.INITIALISING, None, waiting_for=reason)
 
     def _published_pose(self, s: FilterState) -> F64:

@@ -21,6 +21,7 @@ from share.geometry import se3
 from share.odometry import filter
 from share.odometry.initialisation import tilt_sigma
 from share.odometry.landmarks import LandmarkMap
+from share.odometry.relocalisation import POSE_COV
 from share.odometry.state import FilterState
 from share.types import F32, F64, Frame
 from share.vision.keyframe_images import Surfaces
@@ -54,9 +55,6 @@ class KeyframeSpacing:
         )
 
 
-_RELOCALISED_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad^2, m^2: of relocalisation by ORB features
-
-
 class LastPublishedKeyframe:
     """The last published keyframe, for the motion since then by the state's present estimate.
 
@@ -88,9 +86,7 @@ class LastPublishedKeyframe:
             return s.keyframe_poses[k], filter.keyframe_cov(s, k)
         if len(known):
             return filter.relative_pose(s, int(known[0]), k), filter.relative_pose_cov(s, int(known[0]), k)
-        return se3.inverse(self._T_odom_body) @ s.keyframe_poses[k], filter.keyframe_cov(
-            s, k
-        ) + _RELOCALISED_COV
+        return se3.inverse(self._T_odom_body) @ s.keyframe_poses[k], filter.keyframe_cov(s, k) + POSE_COV
 
 
 _MIN_SEEN_SHARE = 0.8  # a smaller share of the newest keyframe's features in use triggers another

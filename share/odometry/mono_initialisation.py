@@ -14,7 +14,7 @@ from share.odometry.feature_matching import anchors_in_camera
 from share.odometry.initial_depth import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
 from share.odometry.landmarks import LASTING_PX, LandmarkMap
 from share.odometry.mono_bundle import FRAME_SIZE, BundleModel, BundleSolution, WindowFrame
-from share.odometry.state import CORE_SIZE, EXTRINSIC, FilterState
+from share.odometry.state import CORE_SIZE, EXTRINSIC, ORIGIN, FilterState
 from share.odometry.visual_update import COMMON_COV
 from share.types import F64, ImuBatch
 
@@ -103,14 +103,14 @@ class MonoWindow:
         frame = np.array([frame_of_keyframe[k] for k in s.keyframe_ids.tolist()])
         indices = np.searchsorted(solution.feature_ids, s.feature_ids)
         poses = (FRAME_SIZE * frame[:, None] + np.arange(6)).ravel()
-        columns = np.r_[last : last + FRAME_SIZE + 6, poses, last + FRAME_SIZE + 6 + indices]
+        columns = np.r_[last : last + FRAME_SIZE + 6, 0:6, poses, last + FRAME_SIZE + 6 + indices]
         calibration = slice(EXTRINSIC.start, CORE_SIZE)
-        fitted = np.r_[0 : EXTRINSIC.start, CORE_SIZE : s.size]
+        fitted = np.r_[0 : EXTRINSIC.start, ORIGIN.start : s.size]
         s.cov = np.zeros((s.size, s.size))
         s.cov[np.ix_(fitted, fitted)] = solution.cov[np.ix_(columns, columns)]
         s.cov[calibration, calibration] = self._first.cov[calibration, calibration]
         s.T, s.v, s.bg, s.ba = solution.T[-1], solution.v[-1], solution.bg, solution.ba
-        s.keyframe_poses, s.rho = solution.T[frame], solution.rho[indices]
+        s.T_origin, s.keyframe_poses, s.rho = solution.T[0], solution.T[frame], solution.rho[indices]
 
 
 def start_mono_window(

@@ -23,6 +23,7 @@ NOISE_PX = 1.0  # standard deviation of a point's position in an image
 GATE_SIGMA = 3.0  # a measurement further off is an outlier
 NEW_SEGMENT_S = 3.0  # LOST for this long: odometry starts a new segment
 MIN_INLIERS = 15  # points that agree with a pose; with fewer there is none
+POSE_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad^2, m^2: of a pose by ORB features
 
 
 @dataclass(frozen=True, eq=False)

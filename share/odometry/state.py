@@ -6,7 +6,8 @@ rotation of everything about the vertical and a translation of everything, then 
 no linearisation point makes the filter gain false information about them.
 
 Columns of the covariance: body pose 6 | velocity 3 | gyro bias 3 | accel bias 3 | T_body_cam 6 (on the right)
-| time offset 1 | keyframe poses 6 each | inverse depths 1 each.
+| time offset 1 | origin 6 | keyframe poses 6 each | inverse depths 1 each. The origin is the body's pose
+where the filter began: its heading and position define odom, its tilt is learnt.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from share.geometry import se3
 from share.types import F64, I64
 
 POSE = slice(0, 6)
@@ -27,6 +29,8 @@ IMU_STATE_SIZE = 15  # columns that IMU propagation changes
 EXTRINSIC = slice(15, 21)
 TIMESHIFT = 21
 CORE_SIZE = 22
+ORIGIN = slice(22, 28)
+KEYFRAMES_START = 28
 
 Float = TypeVar("Float", bound=np.floating[Any])
 
@@ -36,11 +40,12 @@ class FilterState:
     """Means and covariance.
 
     stamp_ns: IMU time. T (4, 4) T_odom_body; v (3,) m/s in odom; bg rad/s, ba m/s^2 (3,) in the body;
-    T_body_cam (4, 4); timeshift_s: IMU time minus camera time.
+    T_body_cam (4, 4); timeshift_s: IMU time minus camera time; T_origin (4, 4): T_odom_body where the filter
+    began.
 
     keyframe_ids (K,), keyframe_poses (K, 4, 4) T_odom_body. feature_ids (N,); anchor (N,): index of the
     keyframe; ray (N, 2): normalised coordinates in the anchor's cam0, exact by definition; rho (N,): inverse
-    depth along the anchor's axis, 1/m. cov (22 + 6 K + N, same).
+    depth along the anchor's axis, 1/m. cov (28 + 6 K + N, same).
     """
 
     stamp_ns: int
@@ -50,6 +55,7 @@ class FilterState:
     ba: F64
     T_body_cam: F64
     timeshift_s: float
+    T_origin: F64
     cov: F64
     keyframe_ids: I64
     keyframe_poses: F64
@@ -60,12 +66,12 @@ class FilterState:
 
     @property
     def size(self) -> int:
-        return CORE_SIZE + 6 * len(self.keyframe_ids) + len(self.feature_ids)
+        return self.features_start + len(self.feature_ids)
 
     @property
     def features_start(self) -> int:
         """The column of the first feature's inverse depth."""
-        return CORE_SIZE + 6 * len(self.keyframe_ids)
+        return KEYFRAMES_START + 6 * len(self.keyframe_ids)
 
     @property
     def rho_variance(self) -> F64:
@@ -75,24 +81,25 @@ class FilterState:
     def means(self) -> tuple[Any, ...]:
         """Return the means, without the covariance, for `restore`."""
         calibration = self.bg, self.ba, self.T_body_cam, self.timeshift_s
-        return self.T, self.v, *calibration, self.keyframe_poses, self.rho
+        return self.T, self.v, *calibration, self.T_origin, self.keyframe_poses, self.rho
 
     def restore(self, means: tuple[Any, ...]) -> None:
         """Restore what `means` returned. Filter steps replace arrays and never write into them."""
         self.T, self.v, self.bg, self.ba, self.T_body_cam, self.timeshift_s = means[:6]
-        self.keyframe_poses, self.rho = means[6:]
+        self.T_origin, self.keyframe_poses, self.rho = means[6:]
 
     def keyframe_columns(self, k: int) -> slice:
         """Return the columns of the pose of keyframe k."""
-        return slice(CORE_SIZE + 6 * k, CORE_SIZE + 6 * k + 6)
+        return slice(KEYFRAMES_START + 6 * k, KEYFRAMES_START + 6 * k + 6)
 
 
 def initial_state(
     stamp_ns: int, T: F64, v: F64, bg: F64, ba: F64, T_body_cam: F64, sigma: F64
 ) -> FilterState:
-    """Return a state without keyframes. sigma (22,): standard deviations of the core, uncorrelated."""
+    """Return a state without keyframes that begins here. sigma (22,): standard deviations of the core,
+    uncorrelated."""
     none = np.zeros(0, np.int64)
-    return FilterState(
+    state = FilterState(
         stamp_ns,
         T.copy(),
         v.copy(),
@@ -100,7 +107,8 @@ def initial_state(
         ba.copy(),
         T_body_cam.copy(),
         0.0,
-        np.diag(sigma**2),
+        T.copy(),
+        np.diag(np.r_[sigma**2, np.zeros(6)]),
         none,
         np.zeros((0, 4, 4)),
         none,
@@ -108,6 +116,25 @@ def initial_state(
         np.zeros((0, 2)),
         np.zeros(0),
     )
+    begin_here(state)
+    return state
+
+
+def begin_here(state: FilterState) -> None:
+    """Make the body's pose the origin."""
+    state.T_origin = state.T.copy()
+    state.cov[ORIGIN] = state.cov[POSE]
+    state.cov[:, ORIGIN] = state.cov[:, POSE]
+
+
+def move(state: FilterState, T: F64) -> None:
+    """Move the body of a state without keyframes to T (4, 4), T_odom_body, and begin there: all errors move
+    along, for they are of the body and not of odom."""
+    T_new_old = T @ se3.inverse(state.T)
+    J = np.eye(len(state.cov))
+    J[POSE, POSE], J[VELOCITY, VELOCITY] = se3.adjoint(T_new_old), T_new_old[:3, :3]
+    state.T, state.v, state.cov = T.copy(), T_new_old[:3, :3] @ state.v, J @ state.cov @ J.T
+    begin_here(state)
 
 
 def twist(state: FilterState, rate: F64) -> F64:
@@ -191,7 +218,7 @@ def drop_keyframes(state: FilterState, keyframe_ids: I64) -> None:
     if not dropped.any():
         return
     keep = ~dropped[state.anchor]
-    _keep_columns(state, np.concatenate([np.ones(CORE_SIZE, bool), np.repeat(~dropped, 6), keep]))
+    _keep_columns(state, np.concatenate([np.ones(KEYFRAMES_START, bool), np.repeat(~dropped, 6), keep]))
     state.feature_ids, state.ray, state.rho = state.feature_ids[keep], state.ray[keep], state.rho[keep]
     state.anchor = (np.cumsum(~dropped) - 1)[state.anchor[keep]]
     state.keyframe_ids, state.keyframe_poses = state.keyframe_ids[~dropped], state.keyframe_poses[~dropped]

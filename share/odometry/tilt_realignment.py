@@ -14,7 +14,6 @@ from share.geometry import se3
 from share.odometry.state import FilterState
 from share.types import F64
 
-_Z_AXIS = 2
 _UPRIGHT_RAD_S = np.radians(0.003)  # speed at which odom turns upright, about the body
 
 
@@ -22,51 +21,33 @@ class TiltRealignment:
     """T_odom_filter (4, 4): pose of the filter's frame, whose z axis is up as estimated now, in odom."""
 
     def __init__(self) -> None:
-        self.T_odom_filter = np.eye(4)
-        self._pivot_position, self._stamp_ns = np.zeros(3), 0
-        self._keyframe_ids, self._rotations = np.zeros(0, np.int64), np.zeros((0, 3, 3))
+        self.T_odom_filter, self._T_odom_start = np.eye(4), np.eye(4)
+        self._T_start_origin, self._stamp_ns = np.eye(4), 0
 
-    def start(self, s: FilterState, pivot_position: F64, new_segment: bool) -> None:
-        """Begin with the state `s` of a filter that began at `pivot_position` (3,). new_segment: odom
-        begins too."""
-        self.T_odom_filter = np.eye(4) if new_segment else self.T_odom_filter
-        self._pivot_position, self._stamp_ns = pivot_position, s.stamp_ns
-        self._store_rotations(s)
+    def start(self, s: FilterState, new_segment: bool) -> None:
+        """Begin with the state `s`, whose frame now is the start. new_segment: odom begins too."""
+        self.T_odom_filter = self._T_odom_start = np.eye(4) if new_segment else self.T_odom_filter
+        self._T_start_origin, self._stamp_ns = s.T_origin, s.stamp_ns
 
     def update(self, s: FilterState) -> None:
-        """Compensate the tilt that the filter has changed since the last call; turn odom a little upright."""
-        tilted_back = _rotation_about(self._pivot_position, -self._tilt_change(s))
-        self.T_odom_filter = se3.orthonormal(self.T_odom_filter @ tilted_back)
+        """Compensate the tilt of the origin that the filter has changed since the start; turn odom a little
+        upright."""
+        T_start_filter = self._T_start_origin @ se3.inverse(s.T_origin)
+        self.T_odom_filter = se3.orthonormal(self._T_odom_start @ T_start_filter)
         remaining = _small_rotation(self.T_odom_filter[:3, :3])
         angle = float(np.linalg.norm(remaining))
         if angle:
             step_rad = _UPRIGHT_RAD_S * 1e-9 * (s.stamp_ns - self._stamp_ns)
             body = self.published_pose(s.T)[:3, 3]
-            self.T_odom_filter = (
-                _rotation_about(body, -remaining * min(step_rad / angle, 1.0)) @ self.T_odom_filter
-            )
+            turn = _rotation_about(body, -remaining * min(step_rad / angle, 1.0))
+            self._T_odom_start = se3.orthonormal(turn @ self._T_odom_start)
+            self.T_odom_filter = turn @ self.T_odom_filter
         self._stamp_ns = s.stamp_ns
-        self._store_rotations(s)
 
     def published_pose(self, T: F64) -> F64:
         """Return T_odom_body (4, 4) to publish for a pose of the filter."""
         out: F64 = self.T_odom_filter @ T
         return out
-
-    def _tilt_change(self, s: FilterState) -> F64:
-        """Return the rotation (3,) rad by which the filter has turned its keyframes, without heading."""
-        R, before = s.keyframe_poses[:, :3, :3], self._rotations
-        if not np.array_equal(self._keyframe_ids, s.keyframe_ids):
-            _, old_rows, new_rows = np.intersect1d(self._keyframe_ids, s.keyframe_ids, return_indices=True)
-            R, before = R[new_rows], before[old_rows]
-        if not len(R):
-            return np.zeros(3)
-        change = _small_rotation((R @ before.swapaxes(1, 2)).mean(axis=0))
-        change[_Z_AXIS] = 0.0  # heading is unobservable
-        return change
-
-    def _store_rotations(self, s: FilterState) -> None:
-        self._keyframe_ids, self._rotations = s.keyframe_ids, s.keyframe_poses[:, :3, :3]
 
 
 def _rotation_about(position: F64, rotation: F64) -> F64:

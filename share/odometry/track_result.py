@@ -19,7 +19,7 @@ class TrackResult:
     images and IMU contradict each other. waiting_for: where there is no pose yet. found_count: features
     found, outliers included. median_nis: over the features; 0 without any. velocity (3,): of the body in
     odom, m/s, and angular_velocity (3,): in the body, rad/s, where the tracker knows them. The covariance is
-    that of a frame whose z axis is up as known now; `share.odometry.tilt_realignment` says how odom differs.
+    relative to where odom began, with the tilt that odom has kept since.
     """
 
     state: TrackState

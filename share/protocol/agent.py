@@ -175,7 +175,7 @@ class Agent:
         if sent:
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
             self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
-            self._self_evaluation.add_keyframe(keyframe, frame, self._now_ns)
+            self._self_evaluation.add_keyframe(keyframe, frame, self._pace.next_send_ns(self._now_ns))
             self._send_evaluation(keyframe.id)
         else:
             self._counts["drop_rate"] += 1
@@ -254,7 +254,10 @@ class Agent:
         if not self._is_of_sent("a welcome", welcome.next_keyframe - 1):
             return
         is_restart = self._connection.sessions.session is not None
-        match self._connection.welcome(welcome):
+        outcome = self._connection.welcome(welcome)
+        if outcome not in (WelcomeOutcome.OUTDATED, WelcomeOutcome.UNSOLICITED):
+            self._pace.hold(welcome.hold_ms, self._now_ns)
+        match outcome:
             case WelcomeOutcome.UNSOLICITED:
                 self._report_invalid("the edge sent a welcome without a hello; ignored")
             case WelcomeOutcome.NEW_SESSION:
@@ -328,6 +331,8 @@ class Agent:
             self._finish()
 
     def _send_data(self) -> None:
+        if self._pace.next_send_ns(self._now_ns) > self._now_ns:
+            return
         for entry in self._ledger.take_due(self._now_ns, self._pace.window):
             self._send_frames(encode(entry.keyframe), entry.keyframe.id)
 

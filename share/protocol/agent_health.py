@@ -11,6 +11,7 @@ from statistics import median
 from typing import Any
 
 from share.metrics.frame_log import NOTICEABLE_LATENCY_MS, summary
+from share.scheduling.room_capacity import TOLERATED_DELAY_MS
 from share.timing import seconds_to_ns
 from share.types import AgentKind, TrackState
 
@@ -58,7 +59,7 @@ class KindLimits:
 
 
 LIMITS = {  # a headset's wearer notices 20 ms; a robot tolerates ten times that
-    AgentKind.AR: KindLimits(NOTICEABLE_LATENCY_MS, 10 * NOTICEABLE_LATENCY_MS),
+    AgentKind.AR: KindLimits(NOTICEABLE_LATENCY_MS, TOLERATED_DELAY_MS),
     AgentKind.ROBOT: KindLimits(10 * NOTICEABLE_LATENCY_MS, 100 * NOTICEABLE_LATENCY_MS),
 }
 _LOW_QOE_S = 3.0

@@ -52,7 +52,18 @@ class RoomMembership:
         self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        return self._admission.objection(event, hello, self._registry, self._out.now_ns)
+        if (reason := self._admission.objection(event, hello, self._registry, self._out.now_ns)) is not None:
+            return reason
+        is_known = event.peer_id in self._registry
+        return None if is_known else self._rate_scheduler.objection(hello.name, hello.kind, self._out.now_ns)
+
+    def _make_room(self, peer: Peer) -> None:
+        """Send away who has to leave for a run that has joined."""
+        displaced = self._rate_scheduler.displaced(peer.name, peer.hello.kind, self._out.now_ns)
+        for other in self._registry.present() if displaced else ():
+            if other.name in displaced:
+                self._refuse(other.id, f"no air left beside headsets: '{peer.name}' has joined")
+                self._mark_gone(other, "left", f"made room for '{peer.name}'")
 
     def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
         """Return the new run of an admitted hello."""
@@ -66,6 +77,7 @@ class RoomMembership:
         self._out.add(ed.AddRun(peer.key, peer.hello, event.credential))
         self._rate_scheduler.begin_run(peer.name)
         self._out.record("agent joined", peer, f"{hello.kind} '{hello.name}'")
+        self._make_room(peer)
         return peer
 
     def _refuse(self, peer_id: bytes, reason: str, version: int = WIRE_VERSION) -> None:
@@ -75,10 +87,11 @@ class RoomMembership:
 
     def _welcome(self, peer: Peer) -> None:
         """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
-        peer.is_welcomed = True
-        self._out.send(peer.id, wire.Welcome(self._session, peer.durable_below))
+        peer.is_welcomed, hold_ms = True, self._rate_scheduler.hold_ms(peer.name, self._out.now_ns)
+        self._out.send(peer.id, wire.Welcome(self._session, peer.durable_below, hold_ms))
         peer.grant = None
-        self._send_grant(peer, self._rate_scheduler.first_grant(peer.name, peer.hello.kind))
+        first = self._rate_scheduler.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
+        self._send_grant(peer, first)
         if peer.last_finding is not None:
             self._send_correction(peer, peer.last_finding, is_repeat=True)
 
@@ -97,13 +110,15 @@ class RoomMembership:
 
     def _capacity_objection(self, peer: Peer) -> str | None:
         """Return why a run that left may not come back; None if it may."""
-        return self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
+        full = self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
+        return full or self._rate_scheduler.objection(peer.name, peer.hello.kind, self._out.now_ns)
 
     def _readmit(self, peer: Peer) -> None:
         self._supersede(peer.name)
         self._registry.mark_present(peer)
         self._out.add(ed.SetPresence(peer.key, True))
         self._out.record("reconnected", peer, "sends again")
+        self._make_room(peer)
 
     def _supersede(self, name: str) -> None:
         """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""

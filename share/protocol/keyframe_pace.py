@@ -21,6 +21,7 @@ class KeyframePace:
         self._bucket, self._score = TokenBucket(RATE_BURST), KeyframeScore()
         self._window: KeyframeWindow | None = None  # None: the edge asks for none
         self._poses = TokenBucket(1.0)
+        self._held_until_ns = 0
 
     @property
     def hz(self) -> float | None:
@@ -37,6 +38,14 @@ class KeyframePace:
         self._bucket.set_rate(None, now_ns)
         self._poses.set_rate(None, now_ns)
         self._window = None
+
+    def hold(self, hold_ms: float, now_ns: int) -> None:
+        """Hold keyframes, as a welcome asks for."""
+        self._held_until_ns = now_ns + round(1e6 * hold_ms)
+
+    def next_send_ns(self, now_ns: int) -> int:
+        """Return when a keyframe of now is sent, at the earliest."""
+        return max(now_ns, self._held_until_ns)
 
     def set_rate(self, rate: Rate, now_ns: int) -> None:
         """Take what the edge asks for."""

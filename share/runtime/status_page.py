@@ -4,8 +4,12 @@ Self-contained, for machines without a 3D view and for phones."""
 
 from __future__ import annotations
 
+import json
+
+from share.colours import AGENT_COLOURS, hex_colour
+
 # Values from outside, such as names, are set as text, never as HTML.
-PAGE = """<!doctype html>
+_TEMPLATE = """<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -106,7 +110,7 @@ function duration(s) {
   return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
 }
 
-const COLOURS = ["#3a97d4", "#e69f00", "#009e73", "#c7b500", "#d55e00", "#cc79a7", "#0072b2", "#999"];
+const COLOURS = %COLOURS%;
 let colours = {};
 const colour = name => colours[name] ??= COLOURS[Object.keys(colours).length % COLOURS.length];
 
@@ -272,3 +276,4 @@ refreshPlan();
 </script>
 </html>
 """
+PAGE = _TEMPLATE.replace("%COLOURS%", json.dumps([hex_colour(colour) for colour in AGENT_COLOURS]))

@@ -22,7 +22,8 @@ import numpy as np
 from share.config import ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
-from share.scheduling.room_budget import RateGrant, RoomController, first_grant
+from share.scheduling.room_budget import RateGrant
+from share.scheduling.room_controller import RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -99,9 +100,21 @@ class Policy:
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
 
-    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
         """Return what an agent that joins may send until its first evaluation; None: everything."""
         return None
+
+    def hold_ms(self, agent: str, now_ns: int) -> float:
+        """Return how long an agent that joins now holds its keyframes, ms."""
+        return 0.0
+
+    def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
+        """Return why the room cannot serve one more agent, for a person; None if it can."""
+        return None
+
+    def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
+        """Return who has to leave for an agent that joins, by name."""
+        return ()
 
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         """Return what the agent may send from now on; None: everything."""
@@ -130,7 +143,7 @@ class FixedPolicy(Policy):
 
     has_merge_gate = True
 
-    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
         return RateGrant(self._hz)
 
     def rate(
@@ -182,9 +195,18 @@ class SharePolicy(Policy):
         self._base_delays: dict[str, BaseDelay] = {}
         self._room = RoomController()
 
-    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
         """Slow start, until the room knows how the agent is served."""
-        return first_grant(self._qoe_parameters(agent, kind).form)
+        return self._room.first_grant(self._qoe_parameters(agent, kind).form, now_ns)
+
+    def hold_ms(self, agent: str, now_ns: int) -> float:
+        return self._room.hold_ms(agent, now_ns)
+
+    def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
+        return self._room.objection(self._qoe_parameters(agent, kind).form, now_ns)
+
+    def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
+        return self._room.displaced(self._qoe_parameters(agent, kind).form, now_ns)
 
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         evaluation = report.evaluation
@@ -232,8 +254,11 @@ class SharePaperPolicy(SharePolicy):
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(replace(config, attribution=False))
 
-    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
         return None
+
+    def hold_ms(self, agent: str, now_ns: int) -> float:
+        return 0.0
 
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         evaluation = report.evaluation

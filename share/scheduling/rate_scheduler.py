@@ -51,9 +51,26 @@ class RateScheduler:
         self.begin_run(agent)
         self._history.pop(agent, None)
 
-    def first_grant(self, agent: str, kind: AgentKind) -> RateGrant | None:
+    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
         """Return what an agent that joins may send; None: everything."""
-        return self._policy.first_grant(agent, kind)
+        return self._policy.first_grant(agent, kind, now_ns)
+
+    def hold_ms(self, agent: str, now_ns: int) -> float:
+        """Return how long an agent that joins now holds its keyframes, ms."""
+        return self._policy.hold_ms(agent, now_ns)
+
+    def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
+        """Return why the room cannot serve one more agent, for a person; None if it can."""
+        return self._policy.objection(agent, kind, now_ns)
+
+    def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
+        """Return who has to leave for an agent that joins, by name."""
+        return self._policy.displaced(agent, kind, now_ns)
+
+    def full_reason(self, now_ns: int) -> str | None:
+        """Return why nobody, or no robot, can join now, for a person; None if all can."""
+        reasons = (self._policy.objection("", kind, now_ns) for kind in AgentKind)
+        return next(filter(None, reasons), None)
 
     def evaluate(self, agent: str, report: AgentReport, comp_ms: float, t_s: float) -> RateGrant | None:
         """Return what the agent may send from now on; None: everything. comp_ms: the edge's part of its

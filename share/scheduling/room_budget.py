@@ -18,20 +18,19 @@ from dataclasses import dataclass, field, replace
 
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
 from share.types import AgentKind
-from share.wire.messages import Evaluation
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
 JOINING_HZ = 1.0  # of who shares a map with nobody yet
 SLOW_START_HZ = 2.0  # of who sends its first keyframes
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
-_POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
+POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
-_MAX_LOAD = 0.95  # beyond, the formula has no meaning
+MAX_LOAD = 0.95  # beyond, the formula has no meaning
 _STEP_HZ = 0.25
 _TIME_CONSTANT_S = 2.0  # of measured times and rates
-_SILENT_S = 3.0  # an agent that has not reported for so long takes no air
+SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
 @dataclass(frozen=True)
@@ -50,6 +49,11 @@ class AgentAir:
     pose_hz: float
     updated_ns: int
     is_placed: bool = True
+
+    @property
+    def elsewhere_ms(self) -> float:
+        """Part of the delay that is not the air's, ms."""
+        return max(0.0, self.delay_ms - 1e3 * self.keyframe_s)
 
     @property
     def least_hz(self) -> float:
@@ -85,7 +89,7 @@ class RoomBudget:
                     for key in ("keyframe_s", "hz", "pose_hz")
                 },
             )
-        present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < _SILENT_S * 1e9}
+        present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < SILENT_S * 1e9}
         return RoomBudget({**present, name: reported})
 
     def without(self, name: str) -> RoomBudget:
@@ -94,8 +98,13 @@ class RoomBudget:
 
     def air_s(self, agent: AgentAir) -> float:
         """Return T of an agent, s."""
-        keyframes_hz = sum(a.hz + _POSE_COST * a.pose_hz for a in self.agents.values())
+        keyframes_hz = sum(a.hz + POSE_COST * a.pose_hz for a in self.agents.values())
         return agent.keyframe_s / (1 + agent.keyframe_s * keyframes_hz)
+
+    @property
+    def longest_air_s(self) -> float | None:
+        """T of the agent whose keyframes take longest, s; None without an agent."""
+        return max(map(self.air_s, self.agents.values()), default=None)
 
     @property
     def is_short(self) -> bool:
@@ -109,9 +118,9 @@ class RoomBudget:
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
-def first_grant(form: AgentKind) -> RateGrant:
-    """Return what an agent may send until its air is known."""
-    return scarce_grant(form, SLOW_START_HZ)
+def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
+    """Return what an agent may send until its air is known, if there are `hz` for it."""
+    return scarce_grant(form, min(SLOW_START_HZ, max(LEAST_HZ[form], hz)))
 
 
 def scarce_grant(form: AgentKind, hz: float) -> RateGrant:
@@ -128,11 +137,11 @@ class _Prediction:
         self._pose_load = 0.0
         for name, agent in self._agents.items():
             pose_hz = SCARCE_POSE_HZ[agent.terms.form] if is_thinned else FULL_POSE_HZ
-            self._pose_load += _POSE_COST * pose_hz * self._air_s[name]
+            self._pose_load += POSE_COST * pose_hz * self._air_s[name]
 
     def load(self, rates: Mapping[str, float]) -> float:
         load = self._pose_load + sum(hz * self._air_s[name] for name, hz in rates.items())
-        return min(load, _MAX_LOAD)
+        return min(load, MAX_LOAD)
 
     def is_noticed(self, rates: Mapping[str, float]) -> bool:
         """Return whether a keyframe of any agent would take longer on the air than a wearer notices."""
@@ -152,7 +161,7 @@ class _Prediction:
             free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n)}
             worth = {n: gain for n, gain in gains.items() if gain > _STEP_HZ * cost and self._comes_first(n)}
             steps = free or worth
-            if not steps or load >= _MAX_LOAD:
+            if not steps or load >= MAX_LOAD:
                 return rates
             best = max(steps, key=lambda name: steps[name])
             rates = {**rates, best: rates[best] + _STEP_HZ}
@@ -184,77 +193,10 @@ class _Prediction:
     def _qoe(self, name: str, hz: float, load: float) -> float:
         """Return the QoE of an agent, by its rate and the load of the air."""
         agent = self._agents[name]
-        elsewhere_ms = max(0.0, agent.delay_ms - 1e3 * agent.keyframe_s)
-        delay_ms = elsewhere_ms + 1e3 * self._air_s[name] / (1 - load)
+        delay_ms = agent.elsewhere_ms + 1e3 * self._air_s[name] / (1 - load)
         if agent.error_cm is None:
             return qoe(delay_ms, None, agent.terms)
         drift = min(agent.drift_cm, agent.error_cm)
         drift_square = drift**2 * max(agent.hz, 1e-3) / max(hz, 1e-3)  # a random walk between keyframes
         error_cm = math.sqrt(agent.error_cm**2 - drift**2 + drift_square)
         return qoe(delay_ms, error_cm, agent.terms)
-
-
-_PERIOD_NS = 500_000_000  # between two allocations
-_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
-
-
-class RoomController:
-    """The budget of one edge over time. Counts are of messages that have arrived so far."""
-
-    def __init__(self) -> None:
-        self._budget = RoomBudget()
-        self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
-        self._grants: dict[str, RateGrant] = {}
-        self._allocated_ns = 0
-
-    def grant(
-        self,
-        name: str,
-        terms: QoeParameters,
-        wanted_hz: float,
-        evaluation: Evaluation,
-        air_ms: float,
-        counts: tuple[int, int],
-        now_ns: int,
-        is_placed: bool = True,
-    ) -> RateGrant:
-        """Return what an agent may send, by its evaluation. air_ms: A. counts: its keyframes and poses so
-        far. is_placed: see `AgentAir`."""
-        hz, pose_hz = self._rates(name, counts, now_ns)
-        reported = AgentAir(
-            terms=terms,
-            wanted_hz=wanted_hz,
-            keyframe_s=air_ms / 1e3,
-            delay_ms=evaluation.delay_ms,
-            error_cm=evaluation.error_cm,
-            drift_cm=evaluation.drift_cm,
-            hz=hz,
-            pose_hz=pose_hz,
-            updated_ns=now_ns,
-            is_placed=is_placed,
-        )
-        self._budget = self._budget.with_report(name, reported)
-        if counts[0] < _SLOW_START_KEYFRAMES:
-            return first_grant(terms.form)
-        if not self._budget.is_short:
-            self._grants = {}
-            return RateGrant(wanted_hz)
-        if name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
-            self._grants, self._allocated_ns = self._budget.allocate(), now_ns
-        return self._grants[name]
-
-    def forget(self, name: str) -> None:
-        """Drop an agent."""
-        self._budget = self._budget.without(name)
-        self._counts.pop(name, None)
-        self._grants.pop(name, None)
-
-    def _rates(self, name: str, counts: tuple[int, int], now_ns: int) -> tuple[float, float]:
-        """Return keyframes and poses a second since the agent's last report."""
-        since_ns, before = self._counts.get(name, (now_ns, counts))
-        self._counts[name] = now_ns, counts
-        elapsed_s = (now_ns - since_ns) / 1e9
-        if elapsed_s <= 0:
-            return 0.0, 0.0
-        hz, pose_hz = ((now - then) / elapsed_s for now, then in zip(counts, before, strict=True))
-        return hz, pose_hz

@@ -23,7 +23,7 @@ from share.sensors.stamps import GAP_FACTOR, MAX_JUMP_NS, StampRepair
 from share.types import ImuBatch
 
 _DEFAULT_IMU_RANGE = ImuRange()
-_DEAD_FACTOR = 10  # a stream silent for this many times a frame's longest wait is no longer waited for
+_DEAD_FACTOR = 10  # a stream that lets images wait for this many times a frame's longest wait is dead
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,8 @@ def sequence_frames(measurements: Iterable[Measurement], merger: FrameMerger) ->
     """Merge measurements into frames by time.
 
     Every frame has its partner image: cam1, or depth if there is no cam1; depth beside cam1 may be missing.
-    Frames go without a dead partner (silent _DEAD_FACTOR times the longest wait) if IMU or depth is alive.
+    Frames go without a dead partner if IMU or depth is alive: one that has sent nothing for _DEAD_FACTOR
+    times the longest wait since an image of cam0 needed it. Where cam0 pauses too, nothing is dead.
 
     Streams may be out of step by up to imu_silent_ms, and out of order within themselves by reorder_ms,
     without any effect on the frames. Memory is bounded by these times.
@@ -114,6 +115,7 @@ class _Buffer:
         self.items: list[tuple[int, Any]] = []
         self.newest = -(2**62)
         self.consumed_until = -(2**62)  # samples up to here are rejected
+        self.awaited_ns: int | None = None  # stamp of the first image of cam0 after the newest sample
         self.was_dead = False  # at the end of all streams
         self._reorder_ns = reorder_ns
 
@@ -129,13 +131,18 @@ class _Buffer:
         """Insert a sample in order; return False if the stamp is there already."""
         if stamp > self.newest:
             self.items.append((stamp, payload))
-            self.newest = stamp
+            self.newest, self.awaited_ns = stamp, None
             return True
         index = bisect_left(self.items, stamp, key=itemgetter(0))
         if stamp == self.newest or (index < len(self.items) and self.items[index][0] == stamp):
             return False
         self.items.insert(index, (stamp, payload))
         return True
+
+    def await_sample(self, stamp: int) -> None:
+        """Record that an image of cam0 at `stamp` needs a sample."""
+        if self.awaited_ns is None and stamp > self.newest:
+            self.awaited_ns = stamp
 
     def first_from(self, stamp: int) -> int | None:
         """Return the stamp of the first waiting sample at or after `stamp`; None if there is none."""
@@ -172,7 +179,7 @@ class FrameMerger:
         self._images = self.buffers[CAM0]
         self._imu = self.buffers.get(IMU)
         self._imu_check = ImuCheck(imu_range)
-        self._newest_ns, self._first_ns = -(2**62), 2**62
+        self._newest_ns = -(2**62)
         self._last_frame_ns: int | None = None
         self.counters = counters
         self._tolerance_ns = _ns(config.sync_tolerance_ms)
@@ -189,7 +196,9 @@ class FrameMerger:
         elif not buffer.insert(stamp, payload):
             self.counters.duplicates += 1
         self._newest_ns = max(self._newest_ns, stamp)
-        self._first_ns = min(self._first_ns, stamp)
+        if stream == CAM0:
+            for other in self.buffers.values():
+                other.await_sample(stamp)
 
     def finish(self) -> None:
         """Mark the end of all streams: waiting frames will get nothing more."""
@@ -197,6 +206,7 @@ class FrameMerger:
             buffer.was_dead = self._is_dead(buffer)
         for buffer in self.buffers.values():
             buffer.newest = self._newest_ns = 2**62
+            buffer.awaited_ns = None
 
     def ready_frames(self) -> Iterator[UndecodedFrame]:
         """Yield the frames that are complete, in order of time."""
@@ -248,11 +258,11 @@ class FrameMerger:
         return (first is not None and imu.complete_until >= first) or self._is_dead(imu)
 
     def _is_dead(self, buffer: _Buffer) -> bool:
-        """Return whether a stream has been silent for too long to wait for it."""
-        return (
-            buffer.was_dead
-            or self._newest_ns - max(buffer.newest, self._first_ns) > _DEAD_FACTOR * self._wait_ns
-        )
+        """Return whether a stream has let images of cam0 wait for too long. Without images its silence says
+        nothing: all of a device pauses."""
+        if buffer.was_dead or buffer.awaited_ns is None:
+            return buffer.was_dead
+        return self._newest_ns - buffer.awaited_ns > _DEAD_FACTOR * self._wait_ns
 
     def _take_partner(self, buffer: _Buffer, stamp: int) -> Any | None:
         """Remove and return the first image within the tolerance; drop earlier ones, which are unpaired."""

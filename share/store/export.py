@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from share.colours import agent_colour
 from share.errors import UsageError
 from share.files.sqlite_file import wal_path
 from share.files.writing import atomic_write, new_folder, open_new, write_errors
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
-from share.recordings.exports.scene import COLOURS, known_points
+from share.recordings.exports.scene import known_points
 from share.recordings.trajectory import Trajectory, format_tum
 from share.store.map_store import MapStore
 from share.types import F64
@@ -98,8 +99,7 @@ def _point_clouds(
 ) -> Iterator[tuple[F64, Colour]]:
     """Yield each keyframe's points in the map frame, (N, 3), and its agent's colour."""
     runs = {
-        run.run_key: (run.hello.rig.T_body_cam0, COLOURS[i % len(COLOURS)])
-        for i, run in enumerate(stored_map.runs)
+        run.run_key: (run.hello.rig.T_body_cam0, agent_colour(i)) for i, run in enumerate(stored_map.runs)
     }
     for keyframe in keyframes:
         T_body_cam0, colour = runs[keyframe.run_key]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from share.colours import Colour
 from share.types import F32, F64, AgentKind
-
-Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +27,15 @@ class Lines:
     segments: F32
     colour: Colour
     width: float
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Marks at positions (N, 3), m, that can be clicked."""
+
+    name: str
+    positions: F64
+    colour: Colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,4 +93,4 @@ class Announcement:
     text: str
 
 
-Drawing = Points | Lines | Body | Picture | Text | FloorGrid | Removed | Announcement
+Drawing = Points | Lines | Marks | Body | Picture | Text | FloorGrid | Removed | Announcement

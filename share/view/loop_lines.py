@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from share.mapping.loops import KeyframeKey
 
 _LOOPS_PER_CHUNK = 64
@@ -50,6 +52,10 @@ class LoopLines:
             chunks |= self.remove(key, other)
         self._of_keyframe.pop(key, None)
         return chunks
+
+    def __iter__(self) -> Iterator[Pair]:
+        for chunk in self._chunks.values():
+            yield from chunk.values()
 
     def chunk(self, chunk: int) -> list[Pair]:
         """Return the loops of a chunk."""

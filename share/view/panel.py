@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
+from share.colours import Colour
 from share.protocol.agent_health import LIMITS
 from share.types import AgentKind
 from share.view import events as ev
-from share.view.drawing import Colour
 from share.view.room import LastCorrection, Room
 
 _MOST_LIMITS = 5.0  # height of a sparkline, in limits; what is later touches its top

@@ -14,18 +14,16 @@ from itertools import pairwise
 
 import numpy as np
 
+from share.colours import Colour, agent_colour
 from share.mapping.loops import KeyframeKey
 from share.types import F64
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
-from share.view.loop_lines import LoopLines
+from share.view.loop_lines import LoopLines, Pair
+from share.view.loop_pictures import KeyframePictures, LoopViews, nearest_to_ray
 from share.view.shapes import frusta, lines, named, shifted
 
-COLOURS: tuple[dr.Colour, ...] = (  # of agents, told apart also by those who see few colours (Okabe and Ito)
-    *((86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66)),
-    *((213, 94, 0), (204, 121, 167), (0, 114, 178), (190, 190, 190)),
-)
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
 _MAP_SPACING_M = 10.0  # between maps that are not joined
 _MAX_CHUNKS = 12  # drawn at a time
@@ -55,7 +53,7 @@ class Room:
         """Begin without a map; what is drawn is to be removed."""
         self.runs: dict[str, RunPath] = {}
         self.corrections: dict[str, LastCorrection] = {}  # by run
-        self._loops = LoopLines()
+        self._loops, self._views = LoopLines(), KeyframePictures()
         self._slots: dict[str, int] = {}  # place of each map, beside each other
         # how to draw what has changed, by name
         self._dirty: dict[str, Callable[[], list[dr.Drawing]]] = dict.fromkeys(self._drawn, _nothing)
@@ -107,6 +105,7 @@ class Room:
         one = run.add_keyframe(event)
         if event.jpeg:
             self._pictures[event.key.agent] = event.jpeg
+            self._views.add(event.key, event.jpeg)
         if one.T_map_body is not None:
             self._mark(event.key.agent, one)
         self._arrange_maps()
@@ -164,6 +163,7 @@ class Room:
         if (run := self.runs.get(key.agent)) is not None and (one := run.remove_keyframe(key.id)) is not None:
             self._mark(key.agent, one)
             self._mark_loops(self._loops.remove_keyframe(key))
+            self._views.remove(key)
 
     def _remove_run(self, name: str) -> None:
         if (run := self.runs.get(name)) is None:
@@ -214,8 +214,9 @@ class Room:
 
     def _mark_loops(self, chunks: Iterable[int]) -> None:
         for chunk in chunks:
-            name = f"/loops/{chunk}"
-            self._dirty[name] = partial(self._draw_loops, chunk, name)
+            for kind, draw in (("loops", self._draw_loops), ("loop-marks", self._draw_loop_marks)):
+                name = f"/{kind}/{chunk}"
+                self._dirty[name] = partial(draw, chunk, name)
 
     def _show_for(self, name: str, thing: dr.Lines | dr.Text, now_s: float, duration_s: float) -> None:
         """Show something for a while."""
@@ -282,10 +283,10 @@ class Room:
         place = None if (run := self.runs.get(run_key)) is None else run.place()
         return None if place is None else shifted(place[1], self._offset(place[0]))
 
-    def colour(self, run: RunPath) -> dr.Colour:
+    def colour(self, run: RunPath) -> Colour:
         """Return the colour of an agent: that of its first run."""
         names = list(dict.fromkeys(other.shown.name for other in self.runs.values()))
-        return COLOURS[names.index(run.shown.name) % len(COLOURS)]
+        return agent_colour(names.index(run.shown.name))
 
     def _draw_body(self, run: RunPath) -> dr.Body | None:
         if (place := run.place()) is None:
@@ -330,7 +331,22 @@ class Room:
         ends = self._loop_ends(self._loops.chunk(chunk))
         return [] if ends is None else [named(lines(ends, _LOOP_COLOUR, 2.0), name)]
 
-    def _loop_ends(self, loops: Iterable[tuple[KeyframeKey, KeyframeKey]]) -> F64 | None:
+    def _draw_loop_marks(self, chunk: int, name: str) -> list[dr.Drawing]:
+        ends = self._loop_ends(self._loops.chunk(chunk))
+        return [] if ends is None else [dr.Marks(name, ends.mean(axis=1), _LOOP_COLOUR)]
+
+    def loop_at(self, origin: F64, direction: F64) -> LoopViews | None:
+        """Return what the loop saw that a ray meets, origin (3,), direction (3,); None if it meets none."""
+        placed = [(pair, ends[0]) for pair in self._loops if (ends := self._loop_ends([pair])) is not None]
+        middles = np.array([ends.mean(axis=0) for _, ends in placed])
+        if (nearest := nearest_to_ray(middles, origin, direction)) is None:
+            return None
+        pair = placed[nearest][0]
+        titles = [f"{self.runs[key.agent].shown.name}, keyframe {key.id}" for key in pair]
+        jpegs = [self._views.get(key) for key in pair]
+        return LoopViews((titles[0], titles[1]), (jpegs[0], jpegs[1]))
+
+    def _loop_ends(self, loops: Iterable[Pair]) -> F64 | None:
         """Return the ends (N, 2, 3) of loops whose keyframes are placed; None without one."""
         out = []
         for pair in loops:

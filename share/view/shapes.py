@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from share.colours import Colour
 from share.types import F32, F64, AgentKind
 from share.view import drawing as dr
 from share.view import events as ev
@@ -19,7 +20,7 @@ def shifted(T: F64, offset: F64) -> F64:
     return out
 
 
-def lines(ends: F64, colour: dr.Colour, width: float) -> dr.Lines:
+def lines(ends: F64, colour: Colour, width: float) -> dr.Lines:
     """Return lines, without a name, between ends (N, 2, 3)."""
     origin = ends.reshape(-1, 3).mean(axis=0)
     return dr.Lines("", origin, (ends - origin).astype(np.float32), colour, width)

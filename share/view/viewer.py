@@ -153,6 +153,9 @@ class Viewer:
     def _draw(self, now_s: float) -> None:
         if drawings := self._room.take_drawings(now_s):
             self._window.draw(drawings)
+        for click in self._window.take_clicks():
+            if (views := self._room.loop_at(click.origin, click.direction)) is not None:
+                self._window.show_views(click.browser, views)
         agents = self._panel.agents
         self._window.follow(lambda name: self._place(agents, name))
         if now_s >= self._panel_due_s:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import base64
 import socket
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
 from typing import Any
 
-import cv2
 import numpy as np
 
-from share.errors import DataError
+from share.colours import Colour
 from share.geometry.se3 import quat_from_matrix
 from share.net.http_guard import HttpGuard
 from share.types import F64, AgentKind
 from share.view import drawing as dr
-from share.vision.image_codec import decode_gray
+from share.view.loop_pictures import LoopViews, shrunk
 
 _MAX_MESSAGE_BYTES = 2**20  # from a browser, which sends its camera and what is chosen
 MAX_BROWSERS = 16
@@ -26,7 +29,20 @@ _ROBOT_RADIUS_M, _ROBOT_HEIGHT_M = 0.17, 0.2  # a TurtleBot 4
 _PICTURE_PX = 160  # width
 _ORBIT, _ABOVE, _FOLLOW = "orbit", "from above", "follow "
 _SEEN_SHARE = 0.7  # distance of the camera, in diagonals of the room
+_MARK_M = 0.07  # radius
+_MARK = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]) * _MARK_M
+_MARK_FACES = np.array([[i, j, k] for i, j in ((0, 2), (2, 1), (1, 3), (3, 0)) for k in (4, 5)])
+_MAX_CLICKS = 16  # that wait
 _START = (np.array([-3.0, -4.0, 3.0]), np.array([0.0, 0.0, 0.0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Click:
+    """A click into the scene: the browser, and its ray, origin (3,) and direction (3,)."""
+
+    browser: int
+    origin: F64
+    direction: F64
 
 
 class Window:
@@ -47,8 +63,9 @@ class Window:
         self._panel = self._server.gui.add_html("")
         self._panel_html = ""
         self._frames: dict[str, Any] = {}  # nodes of bodies by name, with the colour that they were drawn in
-        self._colours: dict[str, tuple[dr.Colour, str]] = {}
+        self._colours: dict[str, tuple[Colour, str]] = {}
         self._cameras: dict[int, _BrowserCamera] = {}
+        self._clicks: deque[Click] = deque(maxlen=_MAX_CLICKS)
         self._followed: tuple[str, ...] = ()
         self._floor: dr.FloorGrid | None = None
         self._server.on_client_connect(self._open)
@@ -97,6 +114,8 @@ class Window:
                     thickness_units="screen",
                     position=one.origin,
                 )
+            case dr.Marks():
+                self._draw_marks(one)
             case dr.Body():
                 self._draw_body(one)
             case dr.Picture():
@@ -113,6 +132,38 @@ class Window:
                 for client in self._server.get_clients().values():
                     client.add_notification(one.title, one.text, auto_close_seconds=6.0)
 
+    def _draw_marks(self, marks: dr.Marks) -> None:
+        upright = np.tile((1.0, 0.0, 0.0, 0.0), (len(marks.positions), 1))
+        handle = self._server.scene.add_batched_meshes_simple(
+            marks.name,
+            _MARK.astype(np.float32),
+            _MARK_FACES.astype(np.uint32),
+            batched_wxyzs=upright,
+            batched_positions=marks.positions,
+            batched_colors=marks.colour,
+            side="double",
+            cast_shadow=False,
+        )
+        handle.on_click(self._take_click)
+
+    def _take_click(self, event: Any) -> None:
+        """Called by viser, from a thread of its own."""
+        origin, direction = (np.array(one, np.float64) for one in (event.ray_origin, event.ray_direction))
+        self._clicks.append(Click(event.client_id, origin, direction))
+
+    def take_clicks(self) -> list[Click]:
+        """Return the clicks since the last call."""
+        return [self._clicks.popleft() for _ in range(len(self._clicks))]
+
+    def show_views(self, browser: int, views: LoopViews) -> None:
+        """Show what the keyframes of a loop saw, in one browser."""
+        if (client := self._server.get_clients().get(browser)) is None:
+            return
+        modal = client.gui.add_modal("loop")
+        with modal:
+            client.gui.add_html("".join(map(_figure, views.titles, views.jpegs)))
+            client.gui.add_button("close").on_click(lambda _: modal.close())
+
     def _draw_body(self, body: dr.Body) -> None:
         colour = body.colour if body.is_current else _GREY
         if self._colours.get(body.name) != (colour, body.label):
@@ -124,7 +175,7 @@ class Window:
         )
         camera.position, camera.wxyz = body.T_room_body[:3, 3], _wxyz(body.T_room_body[:3, :3])
 
-    def _make_body(self, body: dr.Body, colour: dr.Colour) -> None:
+    def _make_body(self, body: dr.Body, colour: Colour) -> None:
         scene, name = self._server.scene, body.name
         self._colours[name] = colour, body.label
         scene.add_frame(name, show_axes=False)
@@ -282,13 +333,15 @@ def _upright(T_room_body: F64, T_body_cam0: F64) -> F64:
 
 def _small_picture(jpeg: bytes) -> Any:
     """Return a JPEG as a small image (h, w, 3) uint8; None if it cannot be decoded."""
-    try:
-        image = decode_gray(jpeg, "image")
-    except DataError:
-        return None
-    height = max(1, round(image.shape[0] * _PICTURE_PX / image.shape[1]))
-    small = cv2.resize(image, (_PICTURE_PX, height), interpolation=cv2.INTER_AREA)
-    return np.repeat(small[:, :, None], 3, axis=2)
+    small = shrunk(jpeg, _PICTURE_PX)
+    return None if small is None else np.repeat(small[:, :, None], 3, axis=2)
+
+
+def _figure(title: str, jpeg: bytes) -> str:
+    """Return a picture with its title as HTML."""
+    data = base64.b64encode(jpeg).decode()
+    picture = f'<img style="width:100%" src="data:image/jpeg;base64,{data}">' if jpeg else "not kept any more"
+    return f'<figure style="margin:0 0 10px"><figcaption>{escape(title)}</figcaption>{picture}</figure>'
 
 
 @contextmanager

@@ -303,7 +303,7 @@ LAYOUTS: dict[type, MessageLayout] = {
         unacknowledged_ms=float,
         clock_error_ms=float | None,
     ),
-    m.Welcome: MessageLayout(16, m.Welcome, session=Int64, next_keyframe=Int64),
+    m.Welcome: MessageLayout(16, m.Welcome, session=Int64, next_keyframe=Int64, hold_ms=float),
     m.Refused: MessageLayout(17, m.Refused, reason=Text),
     m.Ack: MessageLayout(18, m.Ack, next_keyframe=Int64, buffered=Ids),
     Correction: MessageLayout(

@@ -16,6 +16,7 @@ from share.types import F64, AgentKind, Correction, Frame, Keyframe, TrackState,
 
 MAX_RATE_HZ = 1000.0
 MIN_POSE_HZ = 1.0
+MAX_HOLD_MS = 10_000.0  # no edge silences an agent
 MAX_BUFFERED = 256  # ids in one Ack: keyframes buffered at the edge
 MAX_TEXT_LENGTH = 512  # characters of a text for a person
 MAX_REASON_LENGTH = 120  # characters of `Status.reason`
@@ -161,13 +162,16 @@ class Bye:
 @dataclass(frozen=True)
 class Welcome:
     """The edge accepts the run. session: this start of the edge; the agent continues at keyframe
-    `next_keyframe`."""
+    `next_keyframe`, after hold_ms (`share.scheduling.staggered_start`)."""
 
     session: int
     next_keyframe: int
+    hold_ms: float = 0.0
 
     def __post_init__(self) -> None:
         checked_id("next_keyframe", self.next_keyframe)
+        if not 0 <= self.hold_ms <= MAX_HOLD_MS:
+            raise ValueError(f"hold_ms: {self.hold_ms} is outside 0 .. {MAX_HOLD_MS:g}")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import noise_with_vibration
 from share.odometry.initial_depth import prior_from_neighbours
 from share.odometry.landmarks import LASTING_PX
-from share.odometry.state import CORE_SIZE, FilterState, initial_state
+from share.odometry.state import CORE_SIZE, POSE, FilterState, initial_state
 from share.types import ImuBatch
 
 FRAME_HZ = 20
@@ -54,7 +54,8 @@ class Setup:
 @dataclass
 class Run:
     stamps: np.ndarray
-    nees: np.ndarray  # (N, 2): orientation, position, 3 dof each
+    nees: np.ndarray  # (N, 2): orientation, position, 3 dof each, in a frame with z up
+    nees_in_odom: np.ndarray  # (N, 2): the same of the motion since the filter began
     pose_errors: np.ndarray  # (N, 6) right
     state: FilterState
     extrinsics: np.ndarray  # (N, 7) errors: turn, shift, offset
@@ -79,7 +80,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     first = rng.normal(0, 1, CORE_SIZE) * sigma
     state = initial_state(0, T0, v0, bg[0], ba[0], sensors.T_body_cam0, sigma)
     first[15:] = 0
-    filter.correct_means(state, -first)
+    filter.correct_means(state, np.r_[-first, -first[POSE]])
     state.T_body_cam = sensors.T_body_cam0 @ se3.exp(extrinsic)
     log, next_id, keyframe_at = [], 0, -np.inf
     for k in range(1, int(setup.seconds * FRAME_HZ)):
@@ -100,12 +101,19 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
             _forget_idle(state)
         true = path.poses(np.array([state.stamp_ns * 1e-9]))[0]
         error = se3.log(se3.inverse(state.T) @ true)
-        cov = filter.pose_cov(state)
-        nees = [error[a:b] @ np.linalg.solve(cov[a:b, a:b], error[a:b]) for a, b in ((0, 3), (3, 6))]
+        to_body = se3.adjoint(se3.inverse(state.T))
+        nees = _nees(error, to_body @ state.cov[POSE, POSE] @ to_body.T)
+        motion = se3.inverse(state.T_origin) @ state.T
+        error_in_odom = se3.log(se3.inverse(motion) @ se3.inverse(T0) @ true)
+        nees += _nees(error_in_odom, filter.motion_cov_since_origin(state))
         calib = se3.log(se3.inverse(state.T_body_cam) @ sensors.T_body_cam0)
         log.append((stamp, *nees, *error, *calib, state.timeshift_s - offset, level))
     out = np.array(log)
-    return Run(out[:, 0], out[:, 1:3], out[:, 3:9], state, out[:, 9:16], out[:, 16])
+    return Run(out[:, 0], out[:, 1:3], out[:, 3:5], out[:, 5:11], state, out[:, 11:18], out[:, 18])
+
+
+def _nees(error: np.ndarray, cov: np.ndarray) -> list[float]:
+    return [error[part] @ np.linalg.solve(cov[part, part], error[part]) for part in (slice(3), slice(3, 6))]
 
 
 def _shaken(imu: ImuBatch, t: np.ndarray, seed: int, setup: Setup, rng) -> ImuBatch:

@@ -49,7 +49,7 @@ class Liar:
     def _kinds(self) -> Iterator[Callable[[], m.Message]]:
         id_ = lambda least=0: self._pick(*IDS, *range(least, max(1, self.sent)))  # noqa: E731
         session = lambda: self._pick(1, 2, 3, int(self.rng.integers(2**62)))  # noqa: E731
-        yield lambda: m.Welcome(session(), id_())
+        yield lambda: m.Welcome(session(), id_(), self._pick(0.0, 0.0, m.MAX_HOLD_MS))
         yield lambda: m.Refused(self._pick("", "no", "\x1b[2J\r\n", "x" * m.MAX_TEXT_LENGTH))
         yield lambda: m.Ack(id_(), tuple(id_() for _ in range(self._pick(0, 1, 256))))
         yield lambda: Correction(self._pose(), self._cov(), self._map(), id_(), id_(), self._pick(-1, id_()))

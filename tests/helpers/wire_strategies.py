@@ -174,7 +174,7 @@ messages = st.one_of(
     ),
     st.builds(m.Ping, int64, stamps),
     st.just(m.Bye()),
-    st.builds(m.Welcome, int64, ids),
+    st.builds(m.Welcome, int64, ids, st.floats(0, m.MAX_HOLD_MS)),
     st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT_LENGTH)),
     st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_BUFFERED).map(tuple)),
     st.builds(Correction, poses(), covs, words, ids, ids, ids_or_none),

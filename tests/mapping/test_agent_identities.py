@@ -416,6 +416,20 @@ def test_withdrawn_loops_are_decided_once_their_agents_are_compared():
     assert not any(parted.standings for parted in said)
 
 
+def test_a_decision_that_compares_many_views_is_the_last_of_its_turn():
+    def decide(loop: Loop) -> LoopDecision:
+        decided.append(loop)
+        atlas.loop_acceptance._overlap_check.comparison_count += 40 * (loop is loops[1])
+        return LoopDecision(False, "")
+
+    decided: list[Loop] = []
+    atlas, loops = pair_with_withdrawn_loops(decide)
+    atlas.quarantine.reconsider_withdrawn()
+    assert decided == loops[:2]
+    atlas.quarantine.reconsider_withdrawn()
+    assert decided == loops[:10]
+
+
 def test_a_loop_added_again_and_undone_at_once_is_not_reported_as_added():
     def decide(loop: Loop) -> LoopDecision:
         return LoopDecision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())

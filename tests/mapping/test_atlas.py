@@ -419,6 +419,32 @@ def atlas_says(ann: Walker, bob: Walker, loops: list[Loop], found: float) -> str
     return [atlas.propose(replace(x, found_share=found)).reason for x in loops][-1]
 
 
+def test_places_in_all_segments_of_a_map_count(ann: Walker, bob: Walker) -> None:
+    """Cyd sees three places where ann has been and two where bob has."""
+    cyd = Walker("cyd", 5, phase=1.4)
+    atlas, rng = atlas_of(ann, bob, cyd), np.random.default_rng(0)
+    for x in near_loops(ann, bob, rng)[:5]:
+        atlas.propose(x)
+    settle(atlas)
+    seen = near_loops(ann, cyd, rng)[:3] + near_loops(bob, cyd, rng)[8:10]
+    decisions = [atlas.propose(x) for x in seen]
+    assert [d.accepted for d in decisions] == [False] * 4 + [True]
+    assert "5 of 5 required places agree" in decisions[-1].reason
+    assert atlas.map_sizes().keys() == {"ann/0"}
+
+
+def test_a_loop_with_a_third_agent_makes_a_merge_no_weaker(ann: Walker, bob: Walker) -> None:
+    """A copy has to outweigh the loops of ann and bob, and one of bob with cyd, who is in ann's map."""
+    cyd = Walker("cyd", 5, phase=1.4)
+    atlas, rng = atlas_of(ann, bob, cyd), np.random.default_rng(0)
+    for x in near_loops(ann, bob, rng)[:8] + near_loops(ann, cyd, rng)[:8] + near_loops(bob, cyd, rng)[:1]:
+        atlas.propose(x)
+    settle(atlas)
+    last = [atlas.propose(x) for x in twin_loops(ann, bob, 5)][-1]
+    assert "8 places (weight 2.00) oppose it" in last.reason
+    assert not last.accepted
+
+
 def test_many_views_of_one_spot_are_one_place(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     spot = [loop(ann, i, bob, j, np.random.default_rng(i)) for i in (4, 5) for j in (0, 1, 2)]

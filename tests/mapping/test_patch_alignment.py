@@ -13,7 +13,13 @@ from share.geometry import se3
 from share.geometry.camera import rays
 from share.mapping.recognition import patch_alignment
 from share.mapping.recognition.depth_scale import DepthScale
-from share.mapping.recognition.patch_alignment import ImageView, align_from_map, align_images, align_verified
+from share.mapping.recognition.patch_alignment import (
+    ImageView,
+    align_from_map,
+    align_images,
+    align_unsure,
+    align_verified,
+)
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import KeyframeImage, View
 from share.vision.keyframe_images import compress
@@ -275,6 +281,29 @@ def test_a_quarter_of_the_patches_confirms_no_pose_of_the_map(room: Planes) -> N
     assert isinstance(refusal, Refusal) and refusal.reason.endswith("patches align from the map's pose")
     assert refusal.reason[0].isdigit()
     assert isinstance(align_verified(verified(true), query, changed), Verification)
+
+
+def test_a_pose_that_features_leave_uncertain_is_found_by_the_images(pairs) -> None:
+    """From either of two poses that fit, of which one may be elsewhere; not where both are."""
+    true, query, candidate = pairs[0]
+    near, far = true @ se3.exp(2 * OFF), true @ se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.1, 0.0]))
+    for poses in ((near,), (near, true @ se3.exp(-OFF)), (near, far), (far, near)):
+        found = align_unsure(Refusal("uncertain", poses), query, candidate)
+        assert isinstance(found, Verification)
+        assert np.linalg.norm(error(true, found.T_c_q)[3:]) < 0.0015
+    for poses in ((), (far,)):
+        refused = Refusal("uncertain", poses)
+        assert align_unsure(refused, query, candidate) is refused
+
+
+def test_two_poses_by_which_the_images_align_are_none(pairs, monkeypatch: pytest.MonkeyPatch) -> None:
+    true, query, candidate = pairs[0]
+    off = true @ se3.exp(10 * OFF)
+    monkeypatch.setattr(patch_alignment, "_align_from_map", lambda T, *_: verified(T))
+    refused = Refusal("two poses fit", (true, off))
+    assert align_unsure(refused, query, candidate) is refused
+    refused = Refusal("two poses fit", (true, true @ se3.exp(0.01 * OFF)))
+    assert align_unsure(refused, query, candidate) is not refused
 
 
 def test_a_pose_of_the_map_that_is_far_off_is_refused(pairs) -> None:

@@ -87,7 +87,9 @@ def test_scale_that_differs_between_the_directions_is_refused() -> None:
     """A view with doubled depths gives a doubled motion."""
     query, candidate = sights(8, T_C_Q)
     stretched = View(query.view.uv, query.view.points * 2, query.view.descriptors)
-    assert reason(replace(query, view=stretched), candidate).startswith("two poses fit")
+    refused = verify(replace(query, view=stretched), candidate)
+    assert isinstance(refused, Refusal) and refused.reason.startswith("two poses fit")
+    assert len(refused.unsure_poses) == 2
 
 
 @pytest.mark.parametrize("half", [0.05])
@@ -114,7 +116,11 @@ def test_inliers_in_one_corner_are_refused(half: float, monkeypatch: pytest.Monk
 
 def test_an_uncertain_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verification, "MAX_SIGMA_DEG", 0.01)
-    assert "pose uncertain by" in reason(*sights(10, T_C_Q))
+    query, candidate = sights(10, T_C_Q)
+    refused = verify(query, candidate)
+    assert isinstance(refused, Refusal) and "pose uncertain by" in refused.reason
+    (unsure,) = refused.unsure_poses  # of the bodies
+    assert np.abs(se3.log(se3.inverse(bodies(T_C_Q)) @ unsure)).max() < 0.02
 
 
 def test_empty_views_are_refused() -> None:

@@ -113,18 +113,46 @@ def test_correlated_noise_is_shared_by_both_cameras(state):
     assert np.allclose(together - alone, shared, atol=1e-14)
 
 
-def test_covariance_of_a_relative_pose(state):
-    """Return the derivative of T_a_b = T_a^-1 T_b, by differences."""
-
-    def motion(s):
-        return se3.inverse(s.keyframe_poses[0]) @ s.keyframe_poses[1]
-
+def numeric_cov(state, motion):
+    """Return the covariance (6, 6) of a motion of a state, on the right, by differences."""
     J = np.zeros((6, state.size))
     for k in range(state.size):
         up, down = (motion(moved(state, sign * basis(state, k))) for sign in (1, -1))
         J[:, k] = se3.log(se3.inverse(motion(state)) @ up) - se3.log(se3.inverse(motion(state)) @ down)
     J /= 2 * STEP
-    assert np.allclose(filter.relative_pose_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
+    return J @ state.cov @ J.T
+
+
+def test_covariance_of_a_relative_pose(state):
+    expected = numeric_cov(state, lambda s: se3.inverse(s.keyframe_poses[0]) @ s.keyframe_poses[1])
+    assert np.allclose(filter.relative_pose_cov(state, 0, 1), expected, atol=1e-9, rtol=1e-5)
+
+
+def test_covariance_of_the_motion_since_the_origin(state):
+    expected = numeric_cov(state, lambda s: se3.inverse(s.T_origin) @ s.T)
+    assert np.allclose(filter.motion_cov_since_origin(state), expected, atol=1e-9, rtol=1e-5)
+
+
+def test_a_state_that_is_moved_is_as_uncertain_about_its_body_as_before():
+    """As after a relocalisation: at another place, with another heading."""
+    rng = np.random.default_rng(3)
+    s = initial_state(
+        0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, np.ones(CORE_SIZE)
+    )
+    A = rng.normal(size=(CORE_SIZE, CORE_SIZE)) * 0.01
+    s.cov[:CORE_SIZE, :CORE_SIZE] = A @ A.T
+    filter_state.begin_here(s)
+    there = copy.deepcopy(s)
+    filter_state.move(there, se3.exp(np.array([0.02, -0.01, 2.5, 3.0, -4.0, 1.0])))
+    on_the_right = [
+        se3.adjoint(se3.inverse(x.T)) @ x.cov[:6, :6] @ se3.adjoint(se3.inverse(x.T)).T for x in (s, there)
+    ]
+    assert np.allclose(*on_the_right, atol=1e-15)
+    with_bias = [x.T[:3, :3].T @ x.cov[:3, 12:15] for x in (s, there)]  # tilt and accelerometer bias
+    assert np.allclose(*with_bias, atol=1e-15)
+    assert np.allclose(*(x.T[:3, :3].T @ x.cov[6:9, 12:15] for x in (s, there)), atol=1e-15)
+    assert (there.T_origin == there.T).all()
+    assert np.abs(filter.motion_cov_since_origin(there)).max() < 1e-9
 
 
 def test_twist_is_the_derivative_of_the_pose():
@@ -180,7 +208,7 @@ def test_transition(dt, close):
         x.T, x.v = m.T, m.v
         return x, m
 
-    mean, motion = after(np.zeros(CORE_SIZE))
+    mean, motion = after(np.zeros(s.size))
     for k in range(15):
         (up, _), (down, _) = after(basis(s, k)), after(-basis(s, k))
         turn = se3.log(up.T @ se3.inverse(down.T)) / (2 * STEP)

@@ -8,7 +8,15 @@ from share.geometry import se3
 from share.odometry import filter
 from share.odometry.mono_bundle import BundleModel, WindowFrame, solve_bundle
 from share.odometry.mono_shooting import motion_error
-from share.odometry.state import ACCEL_BIAS, CORE_SIZE, GYRO_BIAS, IMU_STATE_SIZE, VELOCITY, initial_state
+from share.odometry.state import (
+    ACCEL_BIAS,
+    CORE_SIZE,
+    GYRO_BIAS,
+    IMU_STATE_SIZE,
+    POSE,
+    VELOCITY,
+    initial_state,
+)
 
 SIGMA, SHOTS, STEP_S, KEYFRAMES, EACH = 0.5 / CAMERA.focal, 16, 0.12, (0, 6), 50
 MODEL = BundleModel(NOISE, GRAVITY, SIGMA, 1e-12 * np.eye(6), 0.4, 0.8, 0.5)
@@ -31,7 +39,7 @@ def scene(seed, outliers=0.0):
     error = np.r_[
         rng.normal(0, 1, IMU_STATE_SIZE) * unsure()[:IMU_STATE_SIZE], np.zeros(CORE_SIZE - IMU_STATE_SIZE)
     ]
-    filter.correct_means(first, -error)
+    filter.correct_means(first, np.r_[-error, -error[POSE]])
     cams = T @ sensors.T_body_cam0
     hosts = np.repeat(KEYFRAMES, EACH)
     ray = CAMERA.normalise(rng.uniform((5, 5), (634, 474), (len(hosts), 2)))

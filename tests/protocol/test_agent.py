@@ -75,6 +75,22 @@ def test_hello_is_repeated_until_a_welcome() -> None:
     assert {type(x) for x in later} == {m.Ping, m.Status}
 
 
+def test_keyframes_are_held_for_as_long_as_the_welcome_says() -> None:
+    agent = Agent(HELLO, Config())
+    handle(agent, ev.AgentTick(), 0)
+    tell(agent, m.Welcome(SESSION, 0, 200.0), MS)
+    handle(agent, tracked(0, pose(0), candidate=True), 10 * MS)
+    for t in (50, 100, 150, 200):
+        assert not only(Keyframe, handle(agent, ev.AgentTick(), t * MS), messages=True)
+    [sent_now] = only(Keyframe, handle(agent, ev.AgentTick(), 205 * MS), messages=True)
+    assert sent_now.id == 0
+    tell(agent, m.Pong(1, 0, 1, 1, SESSION), 206 * MS)
+    tell(agent, m.Ack(1), 235 * MS)
+    told = agent.evaluation(0, 240 * MS)
+    assert told is None or told.ack_ms == pytest.approx(34.0)  # on the air, not while it was held
+    assert agent._self_evaluation.delay.ack_ms(240 * MS) == pytest.approx(34.0)
+
+
 def test_an_unanswered_hello_prints_one_line() -> None:
     agent = Agent(HELLO, Config())
     lines = [line for t in range(100) for line in said(handle(agent, ev.AgentTick(), t * 100 * MS))]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.hellos import hello_of
 
-from share.config import Config
+from share.config import Config, EdgeConfig
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
@@ -17,6 +17,7 @@ from share.protocol.edge_events import SaveChanges
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
+from share.scheduling.policies import POLICIES
 from share.timing import TokenBuckets
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
@@ -246,3 +247,53 @@ def test_no_tracker_starts_for_a_run_that_may_not_return() -> None:
     assert "can track 1 streamed agent" in str(refusal(effects))
     assert not of(effects, ed.StartTracker)
     assert present(edge) == 1
+
+
+# ---------------------------------------------------------------- a room that is full
+
+
+class FullRoom(POLICIES["share"]):
+    """Headsets have room in place of robots; robots have none."""
+
+    def objection(self, agent, kind, now_ns):
+        return "no air for one more robot" if kind is AgentKind.ROBOT else None
+
+    def displaced(self, agent, kind, now_ns):
+        return ("bob",) if agent == "carl" else ()
+
+
+def robot(name, run_id):
+    return hello_of(name, run_id, kind=AgentKind.ROBOT)
+
+
+@pytest.fixture
+def full_edge(monkeypatch):
+    edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
+    come(edge, "ann", 1)
+    tell(edge, 2, robot("bob", 2))
+    monkeypatch.setattr(edge._rate_scheduler, "_policy", FullRoom(Config().control))
+    return edge
+
+
+def test_a_robot_that_finds_no_room_is_told_at_its_hello(full_edge):
+    assert refusal(tell(full_edge, 3, robot("dora", 3), 0.1)) == "no air for one more robot"
+    assert refusal(come(full_edge, "eve", 4, 0.2)) is None
+    assert full_edge.report({})["refused"] == ["no air for one more robot"]
+    assert refusal(tell(full_edge, 2, robot("bob", 2), 0.3)) is None  # it is there already
+
+
+def test_a_headset_takes_the_place_of_a_robot(full_edge):
+    assert refusal(come(full_edge, "carl", 3, 0.1)) == "no air left beside headsets: 'carl' has joined"
+    agents = full_edge.report({})["agents"]
+    assert agents["bob"]["gone"] and not agents["carl"]["gone"] and not agents["ann"]["gone"]
+    assert refusal(tell(full_edge, 2, robot("bob", 2), 5.2)) == "no air for one more robot"
+
+
+def test_a_full_room_is_recorded_once(full_edge):
+    records = [
+        effect.fields
+        for k in range(5)
+        for effect in tell(full_edge, 1, m.Evaluation(-1, 300.0, 1.0), k)
+        if isinstance(effect, ed.WriteEvent)
+    ]
+    assert [(r["event"], r["reason"]) for r in records] == [("room full", "no air for one more robot")]

@@ -59,3 +59,11 @@ def test_a_new_session_of_the_edge_has_asked_for_nothing() -> None:
     pace.begin_session(S)
     assert (pace.hz, pace.window) == (None, None)
     assert pace.take_pose(S) and pace.take_pose(S)
+
+
+def test_a_welcome_may_hold_keyframes_for_a_while() -> None:
+    pace = KeyframePace()
+    pace.hold(250.0, S)
+    assert pace.next_send_ns(S) == pace.next_send_ns(S + S // 4) == S + S // 4
+    assert pace.next_send_ns(2 * S) == 2 * S
+    assert pace.take(CANDIDATE, 0, S)  # it is made, and sent later

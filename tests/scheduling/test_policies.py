@@ -213,18 +213,18 @@ def test_share_paper_steps_once_a_keyframe_by_round_trip_and_processing() -> Non
         assert paper.evaluate("ann", report(AgentKind.AR, 0.7 * k + 0.3, between)) == RateGrant(
             states.rate_hz
         )
-    assert paper.first_grant("ann", AgentKind.AR) is None and not paper.is_windowed
+    assert paper.first_grant("ann", AgentKind.AR, 0) is None and not paper.is_windowed
 
 
 def test_fixed_is_one_rate_for_all_from_the_first_keyframe_on() -> None:
     fixed = made("fixed", replace(CONFIG, fixed_rate_hz=0.7))
     for kind in AgentKind:
-        assert fixed.first_grant("ann", kind) == RateGrant(0.7)
+        assert fixed.first_grant("ann", kind, 0) == RateGrant(0.7)
         for delay_ms in (10.0, 9e3):
             told = Evaluation(0, delay_ms, 3.0)
             assert fixed.evaluate("ann", report(kind, 1.0, told)) == RateGrant(0.7)
     capped = made("fixed", replace(CONFIG, fixed_rate_hz=99.0))
-    assert capped.first_grant("ann", AgentKind.AR) == RateGrant(CONFIG.rate_max_hz)
+    assert capped.first_grant("ann", AgentKind.AR, 0) == RateGrant(CONFIG.rate_max_hz)
 
 
 def test_share_begins_slowly_and_yields_where_keyframes_take_long() -> None:
@@ -232,8 +232,8 @@ def test_share_begins_slowly_and_yields_where_keyframes_take_long() -> None:
         made("share", ControlConfig()),
         RateGrant(LEAST_HZ[AgentKind.AR], SCARCE_POSE_HZ[AgentKind.AR]),
     )
-    assert share.is_windowed and share.first_grant("ann", AgentKind.AR) == first_grant(AgentKind.AR)
-    assert share.first_grant("bob", AgentKind.ROBOT) == first_grant(AgentKind.ROBOT)
+    assert share.is_windowed and share.first_grant("ann", AgentKind.AR, 0) == first_grant(AgentKind.AR)
+    assert share.first_grant("bob", AgentKind.ROBOT, 0) == first_grant(AgentKind.ROBOT)
     slow = Evaluation(0, 400.0, 1.0, track_ms=10.0, rtt_ms=10.0, ack_ms=310.0)
     quick = Evaluation(0, 45.0, 1.0, track_ms=10.0, rtt_ms=5.0, ack_ms=8.0)
     assert share.evaluate("ann", report(AgentKind.AR, 1.0, slow)) == least

@@ -16,9 +16,9 @@ from share.scheduling.room_budget import (
     AgentAir,
     RateGrant,
     RoomBudget,
-    RoomController,
     first_grant,
 )
+from share.scheduling.room_controller import RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 

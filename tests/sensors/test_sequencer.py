@@ -9,8 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from share.config import SequencerConfig
+from share.runtime.source import open_source
 from share.sensors.measurement import Measurement
-from share.sensors.sequencer import FrameMerger, SequencerCounters, sequence_frames
+from share.sensors.sequencer import FrameMerger, SequencerCounters, rig_streams, sequence_frames
 from share.sensors.stamps import MAX_JUMP_S, WRAP_NS
 
 MS = 1_000_000
@@ -215,6 +216,27 @@ def test_frames_go_on_without_a_dead_cam1_if_the_imu_is_alive():
     assert counters.unpaired == 101 - len(alone)
     assert run([m for m in died if m.stamp_ns < 140 * STEP])[0][-1].stamp_ns == 139 * STEP
     assert run([m for m in died if m.stream != "imu"])[1].frames == 100  # none without its partner
+
+
+@pytest.mark.parametrize("pause", [21, 100])
+def test_no_stream_is_dead_after_a_pause_of_all_cameras(pause):
+    """The first image after it waits for its partner, though the IMU goes on meanwhile."""
+    paused = range(10 * STEP, (9 + pause) * STEP)
+    ordered = [m for m in recording(pause + 20) if m.stream == "imu" or m.stamp_ns not in paused]
+    bundles, counters = run(ordered)
+    assert [b.stamp_ns // STEP for b in bundles] == [*range(10), *range(pause + 9, pause + 20)]
+    assert all(b.image1 == b.image0.replace("cam0", "cam1") for b in bundles)
+    assert counters.unpaired == counters.imu_silent == counters.imu_dropped == 0
+
+
+def test_real_images_seconds_apart_are_paired(shared_data):
+    source, counters = open_source(str(shared_data / "real" / "euroc_v1_01_keyframes")), SequencerCounters()
+    streams = rig_streams(source.rig)
+    bundles = list(sequence_frames(source.measurements(), streams, source.rate_hz, CONFIG, counters))
+    assert len(bundles) == 50
+    assert np.diff([b.stamp_ns for b in bundles]).max() > 7e9
+    assert all(b.image1 is not None for b in bundles)
+    assert counters.unpaired == 0
 
 
 def test_depth_beside_stereo_may_be_missing():

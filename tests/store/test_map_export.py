@@ -8,12 +8,13 @@ import pytest
 from helpers.hellos import hello_of
 from helpers.map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution
 
+from share.colours import AGENT_COLOURS as COLOURS
 from share.errors import UsageError
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLoop, SaveRun, map_poses
 from share.recordings.trajectory import read_tum
-from share.store.export import COLOURS, export_map, file_names
+from share.store.export import export_map, file_names
 from share.store.map_store import MapStore
 from share.types import AgentKind
 

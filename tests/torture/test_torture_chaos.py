@@ -102,7 +102,7 @@ class Room:
                 agents = self.edge.snapshot()["agents"]
                 maps = {agents.get(name, {}).get("map_id") for name in ("hope", "faith")}
                 if len(maps) == 1 and maps != {None}:
-                    time.sleep(2.0)  # until they are told
+                    time.sleep(5.0)  # until a correction reaches them, or the next if it was lost
                     return
             time.sleep(0.3)
 

@@ -77,6 +77,7 @@ EXAMPLES: list[m.Message] = [
     m.Ping(1, 10**18),
     m.Bye(),
     m.Welcome(2**62, 3),
+    m.Welcome(1, 0, 660.0),
     m.Refused("the name 'ann' is taken"),
     m.Ack(4, (6, 7)),
     Correction(POSE, np.eye(6), "map-1", 5, 7, 3),

@@ -34,7 +34,6 @@ from sensor_faults import FAULTS, Fault, MeasurementFilter, apply_fault  # noqa:
 
 from share.config import Config  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
-from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Rig  # noqa: E402
 from share.geometry.interpolation import interpolate  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402
@@ -197,7 +196,6 @@ def wrongly_ok(part: FaultRun, truth: Trajectory) -> np.ndarray:
     if not results:
         return np.zeros(0, bool)
     T, cov = estimate.T[known], np.array([r.cov for r in results])
-    true = T[0] @ se3.inverse(true[0]) @ true  # odom keeps the tilt that it began with
     found = deviations(T, cov, true, np.zeros(len(T), np.int64))
     error, C = found.errors[:, 3:], found.cov[:, 3:, 3:]
     distance = np.linalg.norm(error, axis=1)

@@ -25,7 +25,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from share import startup
 
@@ -41,6 +41,7 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import NEAR_M, Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
+from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.lab.evaluate.emulated_network import load_network  # noqa: E402
 from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
 from share.lab.evaluate.simulation import Simulation  # noqa: E402
@@ -85,6 +86,9 @@ class SampledSimulation(Simulation):
     def call_at(self, t_s: float, action: Any) -> None:
         """Call `action` at a time of the simulation."""
         self._schedule(round(t_s * 1e9) - self.now_ns, action)
+
+
+World = TypeVar("World", bound=SampledSimulation)
 
 
 def _waiting_ms(agent: Agent, now_ns: int) -> float:
@@ -132,16 +136,23 @@ def with_policy(text: str, settings: list[str]) -> Config:
     return replace(config, edge=replace(config.edge, policy=name))
 
 
-def play(made: KeyframeSet, config: Config, air: str, seed: int, halved: str | None = None) -> Row:
-    """Simulate one run."""
-    began = time.monotonic()
-    who = list(made.agents.values())
+def begin(
+    kind: type[World], made: KeyframeSet, config: Config, air: str, seed: int
+) -> tuple[World, dict[str, Trajectory], float]:
+    """Return a simulation before its first event, the truth of its keyframes, and its duration, s."""
     seen, truth, seconds = frames_of_all(made, seed)
     known = truth_of(made, NEAR_M, config.control.far_m)
     mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     network = load_network(air)
-    members = [(a.hello, frames, network) for a, frames in zip(who, seen, strict=True)]
-    world = SampledSimulation(config, members, ProcessingDelays(), seed, mapper)
+    members = [(a.hello, frames, network) for a, frames in zip(made.agents.values(), seen, strict=True)]
+    return kind(config, members, ProcessingDelays(), seed, mapper), truth, seconds
+
+
+def play(made: KeyframeSet, config: Config, air: str, seed: int, halved: str | None = None) -> Row:
+    """Simulate one run."""
+    began = time.monotonic()
+    who = list(made.agents.values())
+    world, truth, seconds = begin(SampledSimulation, made, config, air, seed)
     if halved is not None:
         _halve(world, *map(float, halved.split(":")))
     world.run(seconds)

@@ -12,6 +12,7 @@ from consistency import Deviations, deviations, nees, share_within
 
 from share.config import Config
 from share.errors import DataError
+from share.geometry import se3
 from share.geometry.interpolation import associate
 from share.metrics.ate import ate
 from share.metrics.frame_log import RunLog
@@ -32,12 +33,13 @@ ACCURACY = (
 
 @dataclass
 class TrackedRun:
-    """The frames with a pose: stamps, published poses, the filter's poses (z up as known then) and their
-    covariances, index of the unbroken segment. CPU ms of every frame and of every keyframe."""
+    """The frames with a pose: stamps, published poses, the body's motion since the filter began (as published
+    but that odom turns upright) and its covariances, index of the unbroken segment. CPU ms of every frame and
+    of every keyframe."""
 
     stamps: list[int] = field(default_factory=list)
     poses: list[F64] = field(default_factory=list)
-    filter_poses: list[F64] = field(default_factory=list)
+    motions: list[F64] = field(default_factory=list)
     covs: list[F64] = field(default_factory=list)
     segments: list[int] = field(default_factory=list)
     track_ms: list[float] = field(default_factory=list)
@@ -48,12 +50,12 @@ class TrackedRun:
     def trajectory(self) -> Trajectory:
         return Trajectory(np.array(self.stamps, np.int64), np.array(self.poses).reshape(-1, 4, 4))
 
-    def add(self, stamp_ns: int, result: TrackResult, filter_pose: F64 | None) -> None:
+    def add(self, stamp_ns: int, result: TrackResult, motion: F64 | None) -> None:
         self.log.segments += result.new_segment
         self.log.add(stamp_ns, self.track_ms[-1], result.state, result.keyframe_ready)
         if result.T_odom_body is not None:
-            assert result.cov is not None and filter_pose is not None  # of the inertial tracker
-            self.filter_poses.append(filter_pose)
+            assert result.cov is not None and motion is not None  # of the inertial tracker
+            self.motions.append(motion)
             self.stamps.append(stamp_ns)
             self.poses.append(result.T_odom_body)
             self.covs.append(result.cov)
@@ -77,21 +79,22 @@ def follow(source: Source, settings: Config) -> TrackedRun:
         began = time.process_time()
         result = tracker.track(frame)
         run.track_ms.append(1e3 * (time.process_time() - began))
-        filter_pose = None if tracker.state is None else tracker.state.T
+        s = tracker.state
+        motion = None if s is None else se3.inverse(s.T_origin) @ s.T
         if result.keyframe_ready:
             began = time.process_time()
             tracker.make_keyframe(frame)
             tracker.finish_keyframe()
             run.keyframe_ms.append(1e3 * (time.process_time() - began))
-        run.add(frame.stamp_ns, result, filter_pose)
+        run.add(frame.stamp_ns, result, motion)
     return run
 
 
 def series(source: Source, run: TrackedRun) -> Series:
     truth, (stamps, _) = source.truth(), run.trajectory
     assert truth is not None  # the emulator writes it
-    filter_poses = np.array(run.filter_poses).reshape(-1, 4, 4)
-    at, poses, true = associate(Trajectory(stamps, filter_poses), truth)
+    motions = np.array(run.motions).reshape(-1, 4, 4)
+    at, poses, true = associate(Trajectory(stamps, motions), truth)
     chosen = np.isin(stamps, at)
     segment = np.array(run.segments, np.int64)[chosen]
     covs = np.array(run.covs).reshape(-1, 6, 6)[chosen]

@@ -12,13 +12,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from share.colours import agent_colours
 from share.errors import DataError, UsageError
 from share.files.reading import MAX_ARRAYS_BYTES, read_bytes
 from share.files.writing import atomic_write
 from share.lab.emulate.recipe import Progress
 from share.lab.emulate.stage import Actor, RoomStage
 from share.lab.emulate.world.layout import Layout
-from share.lab.evaluate.charts import AGENT_COLOURS, agg_pyplot, save_png
+from share.lab.evaluate.charts import agg_pyplot, save_png
 from share.recordings.convert import stage_progress, to_euroc
 from share.recordings.images import EncodedImage
 from share.recordings.mcap.recorder import Recorder
@@ -158,7 +159,7 @@ def draw_plan(path: Path, layout: Layout, actors: tuple[Actor, ...]) -> None:
     shades = 0.93 - 0.6 * (tops / height).clip(0, 1)
     axes.add_collection(PolyCollection(list(triangles[:, :, :2]), facecolors=[str(s) for s in shades]))
     axes.add_patch(pyplot.Rectangle((0, 0), length, width, fill=False, linewidth=2))
-    for actor, colour in zip(actors, AGENT_COLOURS * len(actors), strict=False):
+    for actor, colour in zip(actors, agent_colours(actor.name for actor in actors).values(), strict=True):
         p, ahead = _camera_path(actor)
         walked_m = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()
         axes.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.3, label=f"{actor.name}, {walked_m:.1f} m")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from share.colours import agent_colours, series_colours
 from share.files.writing import atomic_write
 from share.geometry.se3 import transform
 from share.lab.evaluate.statistics import Interval
@@ -30,7 +31,6 @@ def save_png(figure: Any, path: Path, dpi: int) -> None:
 
 
 _NO_INTERVAL = Interval(float("nan"), float("nan"), float("nan"))
-_COLOURS = ("#00798c", "#d1495b", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 _MAX_COLUMNS = 3  # panels
 
 
@@ -40,10 +40,11 @@ def draw_bars(
     groups: Sequence[str],
     unit: str,
     line: float | None = None,
+    names: Sequence[str] = (),
 ) -> None:
     """Write a PNG with a panel for each of `panels`: {series: a value for each of `groups`}; NaN is left out.
 
-    `line`: a level to draw across.
+    `line`: a level to draw across. `names`: all series of several pictures, so that each keeps its colour.
     """
     pyplot = agg_pyplot()
     width = max(6.0, 0.16 * len(groups) * max(map(len, panels.values())) + 2)
@@ -51,11 +52,12 @@ def draw_bars(
         len(panels), 1, figsize=(width, 2.6 * len(panels)), layout="constrained", sharex=True, squeeze=False
     )
     positions = np.arange(len(groups))
+    colours = series_colours([*names, *(name for series in panels.values() for name in series)])
     for axis, (title, series) in zip(axes[:, 0], panels.items(), strict=True):
         bar_width = 0.8 / len(series)
         for k, (name, values) in enumerate(series.items()):
             offset = (k - (len(series) - 1) / 2) * bar_width
-            axis.bar(positions + offset, values, bar_width, label=name, color=_COLOURS[k % len(_COLOURS)])
+            axis.bar(positions + offset, values, bar_width, label=name, color=colours[name])
         if line is not None:
             axis.axhline(line, color="black", linewidth=1, linestyle="--")
         axis.set(title=title, ylabel=unit)
@@ -65,26 +67,23 @@ def draw_bars(
     _save_with_legend(figure, path, *axes[0, 0].get_legend_handles_labels())
 
 
-def draw_ratios(
-    path: Path, series: Mapping[str, Mapping[str, Interval]], base: str, names: Sequence[str]
-) -> None:
-    """Write a PNG with a bar per measure for each of `series`, as ratios to `base`; whiskers are intervals.
-
-    `names`: all series that have a colour in any picture, so that each keeps its own.
-    """
+def draw_ratios(path: Path, series: Mapping[str, Mapping[str, Interval]], base: str) -> None:
+    """Write a PNG with a bar per measure for each of `series`, as ratios to `base`; whiskers are intervals,
+    where they are known."""
     pyplot = agg_pyplot()
     measures = list(dict.fromkeys(name for values in series.values() for name in values))
     figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
     positions, bar_width = np.arange(len(measures)), 0.8 / len(series)
+    colours = series_colours(series)
     for k, (name, values) in enumerate(series.items()):
         intervals = [values.get(measure, _NO_INTERVAL) for measure in measures]
         value, low, high = (
             np.array([getattr(one, of) for one in intervals]) for of in ("value", "low", "high")
         )
-        whiskers = np.nan_to_num(np.stack([value - low, high - value])).clip(0)
+        has_whiskers = np.isfinite(high - low).any()
+        whiskers = np.nan_to_num(np.stack([value - low, high - value])).clip(0) if has_whiskers else None
         y = positions + (k - (len(series) - 1) / 2) * bar_width
-        colour = _COLOURS[names.index(name) % len(_COLOURS)]
-        axis.barh(y, value, bar_width, xerr=whiskers, label=name, color=colour, ecolor="#555")
+        axis.barh(y, value, bar_width, xerr=whiskers, label=name, color=colours[name], ecolor="#555")
     axis.axvline(1, color="black", linewidth=1, linestyle="--")
     axis.set_yticks(positions, measures)
     axis.invert_yaxis()
@@ -102,19 +101,19 @@ def draw_lines(
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(9, 2.4 * len(panels)), layout="constrained", sharex=True, squeeze=False
     )
-    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    colours = series_colours(name for series in panels.values() for name in series)
     for axis, unit, (title, series) in zip(axes[:, 0], units, panels.items(), strict=True):
         for name, (x, y) in series.items():
-            axis.step(x, y, where="post", label=name, color=_COLOURS[names.index(name) % len(_COLOURS)])
+            axis.step(x, y, where="post", label=name, color=colours[name])
         axis.set(title=title, ylabel=unit)
         axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel(x_label)
-    handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
-    _save_with_legend(figure, path, handles, names)
+    handles = [pyplot.Line2D([], [], color=colour) for colour in colours.values()]
+    _save_with_legend(figure, path, handles, list(colours))
 
 
 def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
-    """Write a PNG of paths from above, a panel for each of `panels`: {series: (path (N, 2) m, dots (M, 2)
+    """Write a PNG of paths from above, a panel for each of `panels`: {agent: (path (N, 2) m, dots (M, 2)
     m)}."""
     pyplot = agg_pyplot()
     columns = min(_MAX_COLUMNS, len(panels))
@@ -127,8 +126,7 @@ def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) 
         rows, columns, figsize=size, layout="constrained", sharex=True, sharey=True
     )
     flat = np.atleast_1d(axes).ravel()
-    names = list(dict.fromkeys(name for series in panels.values() for name in series))
-    colours = {name: _COLOURS[k % len(_COLOURS)] for k, name in enumerate(names)}
+    colours = agent_colours(dict.fromkeys(name for series in panels.values() for name in series))
     for axis, (title, series) in zip(flat, panels.items(), strict=False):
         for name, (path_xy, dots) in series.items():
             axis.plot(*path_xy.T, color=colours[name], linewidth=0.6, alpha=0.6)
@@ -140,7 +138,7 @@ def draw_paths(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) 
     figure.supxlabel("m")
     figure.supylabel("m")
     handles = [pyplot.Line2D([], [], color=colour, marker="o") for colour in colours.values()]
-    _save_with_legend(figure, path, handles, names)
+    _save_with_legend(figure, path, handles, list(colours))
 
 
 def draw_heat_maps(
@@ -181,9 +179,6 @@ def agg_pyplot() -> Any:
     return pyplot
 
 
-AGENT_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
-
-
 def draw_trajectories(
     path: Path,
     agents: Mapping[str, tuple[Trajectory | None, Trajectory]],
@@ -200,7 +195,9 @@ def draw_trajectories(
         1, 2, figsize=(13, 6.2), width_ratios=(3, 2), layout="constrained"
     )
     start = min(truth.stamps_ns[0] for _, truth in agents.values())
-    for (name, (estimate, truth)), colour in zip(agents.items(), AGENT_COLOURS * len(agents), strict=False):
+    colours = agent_colours(agents)
+    for name, (estimate, truth) in agents.items():
+        colour = colours[name]
         p = truth.T[:, :3, 3]
         top_view.plot(p[:, 0], p[:, 1], color=colour, alpha=0.3, linewidth=5, solid_capstyle="round")
         if estimate is None:

@@ -253,7 +253,7 @@ def draw_comparison(folder: Path, rows: Sequence[TrackerRow]) -> str:
         for tracker, values_ms in values("cpu_mean_ms").items()
         if not np.isnan(values_ms).all()
     }
-    draw_bars(folder / "cpu.png", {"mean CPU per frame": causal}, recordings, "ms")
+    draw_bars(folder / "cpu.png", {"mean CPU per frame": causal}, recordings, "ms", names=trackers)
     errors = image_link("Errors of each tracker", "errors.png")
     cpu = image_link("CPU time of each tracker", "cpu.png")
     return f"{errors}\n\n{cpu}\n"

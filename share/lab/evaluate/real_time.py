@@ -47,17 +47,22 @@ EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
 AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run
 _POLL_S = 0.5
 _STOP_S = 10.0
+_MERGE_EVENTS = ("maps merged", "merge undone")
 _EDGE_NICENESS = 10  # on a shared core, about a tenth of an agent's time
 Processes = dict[str, subprocess.Popen[bytes]]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a run, for the live line: frames per agent, agents that share a map, corrections sent."""
+    """Progress of a run, for the live line: frames per agent, agents that share a map, corrections sent.
+
+    merges: a line for each merge of maps so far.
+    """
 
     frames: dict[str, int]
     joined: int
     corrections: int
+    merges: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         frames = "  ".join(f"{name} {count}" for name, count in self.frames.items())
@@ -114,11 +119,11 @@ class Pages:
 
     def show_addresses(self, log: str) -> None:
         for line in log.splitlines():
-            if line.startswith(_PAGE_LINES):
+            if line.startswith(PAGE_LINES):
                 self.show(line)
 
 
-_PAGE_LINES = ("status at ", "live room at ")  # of the edge
+PAGE_LINES = ("status at ", "live room at ")  # of the edge
 
 
 def play_in_real_time(
@@ -149,7 +154,7 @@ def play_in_real_time(
             os.setpriority(os.PRIO_PROCESS, edge.pid, _EDGE_NICENESS)  # before it starts child processes
         address = _wait_for_line(edge, logs["edge"], r"listening on (tcp://\S+?),")
         if pages is not None:
-            _wait_for_line(edge, logs["edge"], f"^({_PAGE_LINES[pages.has_view]}.*)\n")
+            _wait_for_line(edge, logs["edge"], f"^({PAGE_LINES[pages.has_view]}.*)\n")
             pages.show_addresses(_log_text(logs["edge"]))
         agents: Processes = {}
         for number, (name, agent) in enumerate(session.agents.items()):
@@ -208,6 +213,7 @@ class _RunMonitor:
         }
         self._frames = dict.fromkeys(folders, 0)
         self._events, self._corrections, self._membership = GrowingFile(events), 0, MapMembership()
+        self._merges: tuple[str, ...] = ()
 
     def progress(self) -> Progress:
         for name, file in self._odometry.items():
@@ -217,7 +223,11 @@ class _RunMonitor:
             if event["event"] == "correction":
                 self._corrections += 1
                 self._membership.add_correction(event["agent"], event["map_id"])
-        return Progress(dict(self._frames), len(self._membership.sharing_agents), self._corrections)
+            elif event["event"] in _MERGE_EVENTS:
+                text = f"{event['t_s']:7.1f} s {event['event']}: {event['agent']}: {event['reason']}"
+                self._merges = (*self._merges, text)
+        sharing = len(self._membership.sharing_agents)
+        return Progress(dict(self._frames), sharing, self._corrections, self._merges)
 
 
 def _last_line(log: Path) -> str:

@@ -14,19 +14,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from share.errors import DataError, UsageError
 from share.files.reading import MAX_SETTINGS_BYTES, path_inside, read_text
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.statistics import (
     MEASURES,
-    Interval,
-    PolicyComparison,
-    compare_policies,
-    count_no_worse,
-    count_no_worse_on_average,
-    policy_names,
 )
 from share.lab.evaluate.trial import Trial
 from share.lab.train.score import read_scores, score_table
@@ -131,8 +125,7 @@ PROTOCOL = (
     "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/do/evaluate.md",
 )
 _INTERVAL_NOTE = (
-    "In brackets: 95 % confidence intervals by bootstrap over sessions, each with all its runs; "
-    "none with one session."
+    "sweep.csv also has 95 % confidence intervals, by bootstrap over sessions, each with all its runs."
 )
 
 
@@ -158,65 +151,36 @@ def runs_csv(runs: Iterable[RunMetrics]) -> str:
 
 def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a line per point; `rows` as from `share.lab.evaluate.sweep.sweep_table`."""
-    head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
+    columns = [f"{name}{of}" for name in rows[0]["means"] for of in ("", " low", " high")]
     return csv_text(
-        head,
-        ([*row["settings"].values(), row["runs"], *(m.value for m in row["means"].values())] for row in rows),
+        [*rows[0]["settings"], "runs", *columns],
+        (
+            [*row["settings"].values(), row["runs"], *(bound for m in row["means"].values() for bound in m)]
+            for row in rows
+        ),
     )
 
 
 def sweep_markdown(
     rows: Sequence[Mapping[str, Any]], runs: Sequence[RunMetrics], trials: Sequence[Trial]
 ) -> str:
-    """Return the sweep's provenance and table, with intervals, as Markdown."""
+    """Return the sweep's table and provenance as Markdown."""
     titles = {measure.name: measure.title for measure in MEASURES}
     head = [*rows[0]["settings"], "runs", *(titles[name] for name in rows[0]["means"])]
     body = [
-        [*row["settings"].values(), str(row["runs"]), *(_interval_cell(m) for m in row["means"].values())]
+        [
+            *row["settings"].values(),
+            str(row["runs"]),
+            *(format_number(m.value) for m in row["means"].values()),
+        ]
         for row in rows
     ]
-    return "\n\n".join([provenance(runs, trials), markdown_table([head, *body]), _INTERVAL_NOTE]) + "\n"
+    has_intervals = any(math.isfinite(m.low) for row in rows for m in row["means"].values())
+    note = [_INTERVAL_NOTE] if has_intervals else []
+    return "\n\n".join([markdown_table([head, *body]), *note, provenance(runs, trials)]) + "\n"
 
 
-class ReportPictures(NamedTuple):
-    """Markdown that shows the pictures: of the policies compared, of every agent, and of a run over time."""
-
-    comparison: str
-    agents: str
-    timeline: str
-
-
-_NO_PICTURES = ReportPictures("", "", "")
-
-
-def markdown(
-    runs: Sequence[RunMetrics],
-    trials: Sequence[Trial],
-    base: str,
-    failed: Sequence[str] = (),
-    pictures: ReportPictures = _NO_PICTURES,
-) -> str:
-    """Return the report: all policies against `base`. `failed`: names of runs that failed."""
-    names = policy_names(runs)
-    parts = [
-        "# Policies compared",
-        provenance(runs, trials, failed),
-        f"## Each policy, and its ratio to `{base}`",
-        _comparison(runs, names, base),
-        "Values: means over runs that have one. Ratios: over pairs of runs of equal session, link, seed; "
-        f"(n of N): only n of N pairs have both values. {_INTERVAL_NOTE}",
-        pictures.comparison,
-    ]
-    rivals = [name for name in names if name != base]
-    if rivals:  # of the first, in whatever order they are named
-        subject = rivals[0]
-        others = [name for name in names if name != subject]
-        parts += [f"## Errors with `{subject}`", *(_win_counts(runs, subject, other) for other in others)]
-    parts += ["## Every agent", pictures.agents, _agent_table(runs, names), pictures.timeline]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequence[str] = ()) -> str:
+def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial]) -> str:
     """Return a Markdown list: what was played, where, when, by which code, and how it is scored."""
     records = [trial.record for trial in trials]
     conditions = [run.conditions for run in runs]
@@ -227,7 +191,6 @@ def provenance(runs: Sequence[RunMetrics], trials: Sequence[Trial], failed: Sequ
     lines = [
         f"{len(runs)} runs in {_joined_names(c.clock for c in conditions)}, "
         f"{min(r['began'] for r in records)} to {max(r['began'] for r in records)}.",
-        *([f"FAILED, and not in this report: {', '.join(failed)}."] if failed else []),
         f"Policies: {_joined_names(c.policy for c in conditions)}; "
         f"sessions: {_joined_names(c.session for c in conditions)}; "
         f"links: {_joined_names(c.link or 'loopback' for c in conditions)}; "
@@ -252,83 +215,8 @@ def _code_states(conditions: Sequence[Conditions]) -> str:
     return "SEVERAL STATES OF THE CODE: " + ", ".join(f"{code} ({n} runs)" for code, n in runs_by.items())
 
 
-def _comparison(runs: Sequence[RunMetrics], names: Sequence[str], base: str) -> str:
-    comparisons = {name: compare_policies(runs, name, base) for name in names}
-    rows = [["", *names]]
-    for k, measure in enumerate(MEASURES):
-        cells = []
-        for name in names:
-            one = comparisons[name][k]
-            ratio = "" if name == base else f"; {_ratio_cell(one)}"
-            cells.append(format_number(one.value.value) + ratio)
-        rows.append([measure.title, *cells])
-    return markdown_table(rows)
-
-
-def _win_counts(runs: Sequence[RunMetrics], name: str, other: str) -> str:
-    wins, total = count_no_worse(runs, name, other)
-    means, total_means = count_no_worse_on_average(runs, name, other)
-    return (
-        f"* at most those with `{other}` in {wins} of {total} runs of an agent (in the shared map with "
-        f"both), and in {means} of {total_means} means over an agent's runs on a session"
-    )
-
-
-def _agent_table(runs: Sequence[RunMetrics], names: Sequence[str]) -> str:
-    rows = [["session", "agent", *(f"{name}: ms, cm" for name in names)]]
-    for session in dict.fromkeys(run.conditions.session for run in runs):
-        for agent in dict.fromkeys(
-            a.agent for r in runs if r.conditions.session == session for a in r.agents
-        ):
-            cells = [
-                f"{format_number(agent_mean(runs, name, session, agent, 'latency_ms'))}, "
-                f"{format_number(agent_mean(runs, name, session, agent, 'ate_cm'))}"
-                for name in names
-            ]
-            rows.append([session, agent, *cells])
-    return markdown_table(rows)
-
-
-def agent_mean(runs: Sequence[RunMetrics], policy: str, session: str, agent: str, field: str) -> float:
-    """Return the mean of a field of an agent over the runs of a policy on a session, NaN without any."""
-    values = [
-        getattr(one, field)
-        for run in runs
-        if run.conditions.policy == policy and run.conditions.session == session
-        for one in run.agents
-        if one.agent == agent
-    ]
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan
-
-
 def _condition_values(run: RunMetrics) -> list[object]:
     return [getattr(run.conditions, name) for name in _CONDITION_COLUMNS]
-
-
-def _ratio_cell(comparison: PolicyComparison) -> str:
-    partly = (
-        f" ({comparison.pairs} of {comparison.total_pairs})"
-        if 0 < comparison.pairs < comparison.total_pairs
-        else ""
-    )
-    return _interval_text(comparison.ratio, ".2f") + partly
-
-
-def _interval_cell(interval: Interval) -> str:
-    return _interval_text(interval, ".3g")
-
-
-def _interval_text(interval: Interval, number_format: str) -> str:
-    """Return value and interval; a dash for NaN, no interval where it is unknown (one session)."""
-    if math.isnan(interval.value):
-        return "–"
-    bounds = (
-        ""
-        if math.isnan(interval.low)
-        else f" [{interval.low:{number_format}}, {interval.high:{number_format}}]"
-    )
-    return f"{interval.value:{number_format}}{bounds}"
 
 
 _STYLE = """
@@ -339,7 +227,14 @@ table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabula
   overflow-x: auto; }
 th, td { padding: 0.25rem 0.75rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } th { background: #f3f3f3; }
-tbody tr:hover { background: #f8f8f0; }
+tbody tr:hover { background: #f8f8f0; } td strong { color: #00626f; } li { overflow-wrap: anywhere; }
+h1 + p { font-size: 1.15rem; }
+@media (max-width: 40rem) {
+  body { font-size: 15px; margin: 1rem auto; padding: 0 .8rem; } ul { padding-left: 1.2rem; }
+  table { font-size: 13px; } th, td { padding: .25rem .5rem; }
+  th:first-child, td:first-child { position: sticky; left: 0; background: #fff; white-space: normal; }
+  th:first-child { background: #f3f3f3; }
+}
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 14px; }
 """
 _PICTURE = re.compile(r'<p><img alt="([^"]*)" src="([^"]*)" ?/?></p>')

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from share.lab.evaluate.charts import draw_bars, draw_lines, draw_paths, draw_ratios
-from share.lab.evaluate.report import ReportPictures, agent_mean, image_link
+from share.lab.evaluate.policy_report import ReportPictures, agent_mean
+from share.lab.evaluate.report import image_link
 from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.scoring import MergeLocations, ground_truths, merge_locations, traces
 from share.lab.evaluate.statistics import compare_policies, policy_names
@@ -70,8 +71,10 @@ def _draw_ratios(folder: Path, runs: Sequence[RunMetrics], names: Sequence[str],
     }
     if not compared:
         return ""
-    draw_ratios(folder / "parts.png", compared, base, names)
-    return _image_links({f"Each policy's ratio to {base}; whiskers: 95 % confidence": "parts.png"})
+    draw_ratios(folder / "parts.png", compared, base)
+    has_intervals = any(np.isfinite(one.low) for ratios in compared.values() for one in ratios.values())
+    whiskers = "; whiskers: 95 % confidence" if has_intervals else ""
+    return _image_links({f"Each policy's ratio to {base}{whiskers}": "parts.png"})
 
 
 def _image_links(files: Mapping[str, str]) -> str:

@@ -70,11 +70,13 @@ _COMPARE_DIGITS = 9  # decimals to which two errors are compared
 
 @dataclass(frozen=True)
 class Measure:
-    """A quantity of a run. `name`: its column in sweep.csv."""
+    """A quantity of a run. `name`: its column in sweep.csv. `better`: -1 where less is better, 1 where more
+    is, 0 where neither."""
 
     name: str
     unit: str
     value_of: Callable[[RunMetrics], float]
+    better: int = -1
 
     @property
     def title(self) -> str:
@@ -102,15 +104,15 @@ MEASURES = (
     Measure("merges per metre", "1/m", lambda run: run.merges_per_metre),
     Measure("AR ATE in the map", "cm", _mean_over_kind("ar", lambda a: a.ate_cm)),
     Measure("robot ATE in the map", "cm", _mean_over_kind("robot", lambda a: a.ate_cm)),
-    Measure("AR estimated error", "cm", _mean_over_kind("ar", lambda a: a.estimated_error_cm)),
-    Measure("robot estimated error", "cm", _mean_over_kind("robot", lambda a: a.estimated_error_cm)),
+    Measure("AR estimated error", "cm", _mean_over_kind("ar", lambda a: a.estimated_error_cm), 0),
+    Measure("robot estimated error", "cm", _mean_over_kind("robot", lambda a: a.estimated_error_cm), 0),
     Measure("joint ATE", "cm", lambda run: run.joint_ate_cm),
     Measure("AR RPE over 1 s", "cm", _mean_over_kind("ar", lambda a: a.rpe_1s_cm)),
     Measure("AR time to shared map", "s", _mean_over_kind("ar", lambda a: a.shared_map_s)),
-    Measure("agents in one map", "", lambda run: float(run.agents_in_largest_map)),
-    Measure("AR keyframes sent", "Hz", _mean_over_kind("ar", lambda a: a.rate_hz)),
-    Measure("AR QoE", "", _mean_over_kind("ar", lambda a: a.qoe)),
-    Measure("robot QoE", "", _mean_over_kind("robot", lambda a: a.qoe)),
+    Measure("agents in one map", "", lambda run: float(run.agents_in_largest_map), 1),
+    Measure("AR keyframes sent", "Hz", _mean_over_kind("ar", lambda a: a.rate_hz), 0),
+    Measure("AR QoE", "", _mean_over_kind("ar", lambda a: a.qoe), 1),
+    Measure("robot QoE", "", _mean_over_kind("robot", lambda a: a.qoe), 1),
 )
 
 

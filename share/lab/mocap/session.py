@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from share import __version__
+from share.colours import agent_colour, hex_colour
 from share.files.json_file import nan_to_none
 from share.files.writing import atomic_write
 from share.geometry import se3
-from share.lab.evaluate.charts import AGENT_COLOURS, agg_pyplot, save_png
+from share.lab.evaluate.charts import agg_pyplot, save_png
 from share.lab.mocap.align import AlignedDevice, common_level
 from share.lab.mocap.offset import WINDOW_NS, imu_rotations, mocap_rotations
 from share.lab.mocap.verdict import shared_sigmas
@@ -164,7 +165,7 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[AlignedDevice, Trajec
     grid = figure.add_gridspec(len(devices), 2, width_ratios=(2, 3))
     top_view = figure.add_subplot(grid[:, 0])
     for k, (name, (aligned, truth)) in enumerate(devices.items()):
-        colour = AGENT_COLOURS[k % len(AGENT_COLOURS)]
+        colour = hex_colour(agent_colour(k))
         p = np.insert(truth.T[:, :3, 3], _after_gaps(truth.stamps_ns), np.nan, axis=0)
         top_view.plot(p[:, 0], p[:, 1], color=colour, linewidth=1.2, label=f"{name}, {aligned.seconds:.1f} s")
         top_view.plot(*p[0, :2], "o", color=colour)

@@ -24,7 +24,8 @@ from share.types import F64
 
 _MIN_LOOP_SUPPORT = 12  # loops between two segments; fewer may fit only because a map was bent
 _MAX_WITHDRAWN = 2000  # newest withdrawn loops
-_RECONSIDERED_AT_ONCE = 8  # withdrawn loops: 13 ms each where they may join maps
+_RECONSIDERED_AT_ONCE = 8  # withdrawn loops
+_COMPARED_AT_ONCE = 8  # pairs of views, after which no further loop is decided
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +200,12 @@ class Quarantine:
         Those still forbidden are withdrawn again, while their keyframes exist.
         """
         odometry, decisions = self._graph.odometry, list[LoopDecision]()
-        while self._to_reconsider and len(decisions) < _RECONSIDERED_AT_ONCE:
+        most_comparisons = self._loop_acceptance.comparison_count + _COMPARED_AT_ONCE
+        while (
+            self._to_reconsider
+            and len(decisions) < _RECONSIDERED_AT_ONCE
+            and self._loop_acceptance.comparison_count < most_comparisons
+        ):
             loop = self._to_reconsider.pop(0)
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
                 continue

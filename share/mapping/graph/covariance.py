@@ -16,64 +16,8 @@ from share.geometry import se3
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
 from share.mapping.graph.gravity import gravity_equations
 from share.mapping.graph.optimiser import NormalEquations, OptimisedPoses, weighted_jacobians
+from share.mapping.graph.shortest_paths import ShortestPaths, poses_on_paths
 from share.types import F64, I64
-
-
-class ShortestPaths:
-    """Shortest paths (Dijkstra 1959) among n poses with E undirected edges: ends a, b (E,), cost (E,)."""
-
-    def __init__(self, n: int, a: I64, b: I64, cost: F64) -> None:
-        from scipy.sparse import csc_array, csr_array
-
-        e = len(a)
-        ends, others = np.concatenate([a, b]), np.concatenate([b, a])
-        leaving = csc_array((np.ones(2 * e), ends, np.arange(2 * e + 1)), shape=(n, 2 * e)).tocsr()
-        self._starts, order = leaving.indptr, leaving.indices  # sorted by start; parallel edges are kept
-        self._targets, self._edge_index = others[order], order % max(e, 1)
-        self._graph = csr_array((self._directed(cost), self._targets, self._starts), shape=(n, n))
-
-    @property
-    def _cost(self) -> F64:
-        return np.asarray(self._graph.data)
-
-    def _directed(self, cost: F64) -> F64:
-        """Cost of every edge in both directions, sorted by start."""
-        return np.asarray(np.maximum(cost[self._edge_index], 1e-300))  # zero would mean no edge
-
-    def set_cost(self, cost: F64) -> None:
-        """Change the cost (E,) of the edges."""
-        self._graph.data = self._directed(cost)
-
-    def predecessors(self, start: int) -> I64:
-        """Return the pose before each (n,) on its path from `start`; negative for the start and unreachable
-        ones.
-        """
-        from scipy.sparse.csgraph import dijkstra
-
-        return np.asarray(dijkstra(self._graph, indices=start, return_predecessors=True)[1], np.int64)
-
-    def cheapest_edges(self, u: I64, v: I64) -> I64:
-        """Return the index (K,) of the cheapest edge between each pair of neighbours u, v (K,)."""
-        count = self._starts[u + 1] - self._starts[u]
-        first = np.cumsum(count) - count
-        all_of_u = np.arange(count.sum()) + np.repeat(self._starts[u] - first, count)
-        arrives = self._targets[all_of_u] == np.repeat(v, count)
-        fits, pair = all_of_u[arrives], np.repeat(np.arange(len(u)), count)[arrives]
-        order = np.lexsort((self._cost[fits], pair))
-        first_of_pair = order[np.searchsorted(pair[order], np.arange(len(u)))]
-        return np.asarray(self._edge_index[fits[first_of_pair]], np.int64)
-
-
-def poses_on_paths(predecessors: I64, goals: I64) -> I64:
-    """Return all poses on the paths to `goals`, ascending; the goals are included, the start is not."""
-    is_visited = np.zeros(len(predecessors), bool)
-    frontier = goals[predecessors[goals] >= 0]
-    while len(frontier):
-        is_visited[frontier] = True
-        frontier = predecessors[frontier]
-        frontier = frontier[(predecessors[frontier] >= 0) & ~is_visited[frontier]]
-    return np.flatnonzero(is_visited)
-
 
 PosesById = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by id
 
@@ -86,9 +30,13 @@ class CovariancePaths:
         self._slots: dict[int, int] = {}  # index of each pose in the search
         self._free_slots: list[int] = []
         self._rows: dict[PoseEdge, int] = {}
-        self._edges: list[PoseEdge] = []
+        self._edges: list[PoseEdge | None] = []  # by row; None: free
+        self._free_rows: list[int] = []
         self._table = np.zeros((64, 3 + 16 + 36))  # slots of a and b, cov_trace, T_a_b, cov
-        self._paths: ShortestPaths | None = None  # None: edges have changed
+        self._paths = ShortestPaths(0, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+        # Rows that `_paths` does not know yet, and those it still has:
+        self._added: dict[int, None] = {}
+        self._removed: dict[int, tuple[int, int]] = {}  # with their slots
 
     def add(self, edge: PoseEdge) -> None:
         """Add an edge. Raises ValueError for a duplicate."""
@@ -98,26 +46,31 @@ class CovariancePaths:
             self._degree[end] += 1
             if end not in self._slots:
                 self._slots[end] = self._free_slots.pop() if self._free_slots else len(self._slots)
-        row = self._rows[edge] = len(self._edges)
-        self._edges.append(edge)
+        if not self._free_rows:
+            self._free_rows.append(len(self._edges))
+            self._edges.append(None)
+        row = self._rows[edge] = self._free_rows.pop()
+        self._edges[row] = edge
         if row == len(self._table):
             self._table = np.concatenate([self._table, np.zeros_like(self._table)])
         ends = self._slots[edge.a], self._slots[edge.b], edge.cov_trace
         self._table[row] = np.concatenate([ends, edge.T_a_b.ravel(), edge.cov.ravel()])
-        self._paths = None
+        self._added[row] = None
 
     def remove(self, edge: PoseEdge) -> None:
         """Remove an edge. Raises KeyError if it is missing."""
-        row, last = self._rows.pop(edge), self._edges.pop()
-        if last is not edge:
-            self._edges[row], self._rows[last] = last, row
-            self._table[row] = self._table[len(self._edges)]
+        row, slots = self._rows.pop(edge), (self._slots[edge.a], self._slots[edge.b])
+        self._edges[row] = None
+        self._free_rows.append(row)
         for end in (edge.a, edge.b):
             self._degree[end] -= 1
             if not self._degree[end]:
                 del self._degree[end]
                 self._free_slots.append(self._slots.pop(end))
-        self._paths = None
+        if row in self._added:
+            del self._added[row]
+        else:
+            self._removed[row] = slots
 
     def covariances_from(self, start: int, goals: Sequence[int], poses: PosesById) -> list[F64 | None]:
         """Covariance (6, 6) of T_start_goal for each goal, along the path of least covariance; or None.
@@ -126,25 +79,34 @@ class CovariancePaths:
         """
         if start not in self._slots:
             return [np.zeros((6, 6)) if goal == start else None for goal in goals]
-        predecessors = self._updated_paths().predecessors(self._slots[start])
+        known_goals = [self._slots[goal] for goal in goals if goal in self._slots]
+        predecessors = self._updated_paths().predecessors_of(
+            self._slots[start], np.array(known_goals, np.int64)
+        )
         paths = [self._path_slots(predecessors, start, goal) for goal in goals]
         visited = np.array(sorted({slot for path in paths for slot in path or ()}), np.int64)
         steps = self._step_covariances(predecessors[visited], visited, start, poses)
-        known = [i for i, path in enumerate(paths) if path is not None]
-        sums = [steps[np.searchsorted(visited, paths[i] or [])].sum(0) for i in known]
+        reached = [i for i, path in enumerate(paths) if path is not None]
+        sums = [steps[np.searchsorted(visited, paths[i] or [])].sum(0) for i in reached]
         out: list[F64 | None] = [None] * len(goals)
-        if known:  # from perturbing `start` to perturbing the goal
-            goal_poses = np.array([poses[goals[i]] for i in known])
+        if reached:  # from perturbing `start` to perturbing the goal
+            goal_poses = np.array([poses[goals[i]] for i in reached])
             covs = se3.inverse_cov(se3.inverse(goal_poses) @ poses[start], np.array(sums))
-            for i, cov in zip(known, covs, strict=True):
+            for i, cov in zip(reached, covs, strict=True):
                 out[i] = cov
         return out
 
     def _updated_paths(self) -> ShortestPaths:
-        if self._paths is None:
-            a, b, cov_trace = self._table[: len(self._edges), :3].T
+        if self._removed:
+            a, b = np.array(list(self._removed.values()), np.int64).T
+            self._paths.remove(a, b, np.array(list(self._removed), np.int64))
+            self._removed.clear()
+        if self._added:
+            rows = np.array(list(self._added), np.int64)
+            a, b, cov_trace = self._table[rows, :3].T
             size = len(self._slots) + len(self._free_slots)
-            self._paths = ShortestPaths(size, a.astype(np.int64), b.astype(np.int64), cov_trace)
+            self._paths.add(size, a.astype(np.int64), b.astype(np.int64), cov_trace, rows)
+            self._added.clear()
         return self._paths
 
     def _path_slots(self, predecessors: I64, start: int, goal: int) -> list[int] | None:
@@ -164,7 +126,7 @@ class CovariancePaths:
         table = self._table[rows]
         is_forward = table[:, 1] == visited
         directed_edges = zip([self._edges[row] for row in rows], is_forward, strict=True)
-        ends = [edge.b if is_forward_edge else edge.a for edge, is_forward_edge in directed_edges]
+        ends = [edge.b if is_forward_edge else edge.a for edge, is_forward_edge in directed_edges if edge]
         T_a_b, cov = table[:, 3:19].reshape(-1, 4, 4), table[:, 19:].reshape(-1, 6, 6)
         cov = np.where(is_forward[:, None, None], cov, se3.inverse_cov(T_a_b, cov))
         end_poses = np.array([poses[end] for end in ends]).reshape(-1, 4, 4)

@@ -51,6 +51,7 @@ _FLOOR_DEG, _FLOOR_M = 0.02, 0.001
 # degrees of freedom) are below 6 at 0.3 m, 15 at 1.2 m, 25 at 2 m, 75 at 3 m (three emulated sessions).
 _WIDE_VARIANCE_PER_M2 = 0.5
 _UNALIGNED_VARIANCE = 10.0  # factor on that of a pair whose patches do not align: NEES of 17 to 116 measured
+_SAME_CHI2 = 22.5  # 99.9 %, 6 degrees of freedom
 _SHARED_ERROR = 2.0  # factor on sigma in the graph: the loops of a keyframe share its depths' errors
 
 
@@ -155,6 +156,24 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
     if scale is not None:
         scale = scale._replace(shared_sigma=_shared_sigma(query, candidate))
     return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov, depth_scale=scale)
+
+
+def align_unsure(refused: Refusal, query: ImageView, candidate: ImageView) -> Verification | Refusal:
+    """Return the pose of a pair whose features do not determine one, by aligning the images from each pose
+    that they allow; the refusal where that fails, or gives two poses."""
+    found: list[Verification] = []
+    for T_c_q in refused.unsure_poses:
+        aligned = _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
+        if isinstance(aligned, Verification):
+            found.append(aligned)
+    if not found or any(_differ(found[0], other) for other in found[1:]):
+        return refused
+    return found[0]
+
+
+def _differ(a: Verification, b: Verification) -> bool:
+    xi = se3.log(se3.inverse(a.T_c_q) @ b.T_c_q)
+    return bool(xi @ np.linalg.solve(a.cov + b.cov, xi) > _SAME_CHI2)
 
 
 def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verification | Refusal:

@@ -7,7 +7,8 @@ failed and by how much.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,13 +94,20 @@ class Verification:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why there is no pose, e.g. "17 inliers of 25 needed"."""
+    """Why there is no pose, e.g. "17 inliers of 25 needed".
+
+    unsure_poses: T_c_q (4, 4) as in `Verification` that enough features fit, but do not determine."""
 
     reason: str
+    unsure_poses: tuple[F64, ...] = field(default=(), compare=False)
 
 
 class _RefusedError(Exception):
-    """A failed check; the text is the reason."""
+    """A failed check; the text is the reason. unsure: fits that enough features support."""
+
+    def __init__(self, reason: str, unsure: Sequence[_PoseFit] = ()) -> None:
+        super().__init__(reason)
+        self.unsure = [fit for fit in unsure if fit.inliers >= MIN_INLIERS]
 
 
 def verify(query: CameraView, candidate: CameraView, seed: int = 0) -> Verification | Refusal:
@@ -110,7 +118,9 @@ def verify(query: CameraView, candidate: CameraView, seed: int = 0) -> Verificat
     try:
         return _verify_or_raise(query, candidate, seed)
     except _RefusedError as failed:
-        return Refusal(str(failed))
+        T_body_cam_q, T_body_cam_c = query.T_body_cam0, candidate.T_body_cam0
+        unsure = [T_body_cam_c @ fit.T @ se3.inverse(T_body_cam_q) for fit in failed.unsure]
+        return Refusal(str(failed), tuple(unsure))
     except np.linalg.LinAlgError:
         return Refusal("degenerate geometry: the matches do not determine a pose")
 
@@ -157,10 +167,9 @@ def _verify_or_raise(query: CameraView, candidate: CameraView, seed: int) -> Ver
         known = int(np.isfinite(y[:, 2]).sum())
         _require_count(known, MIN_DIRECTION_INLIERS, f"inliers with the {side}'s depth")
         _check_spread(y, side)
-    _check_uncertainty(fit.cov)
-    if has_gravity:
-        _check_gravity(fit.T, query, candidate)
+    _check_uncertainty(fit)
     T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
+    _require_upright(T, query, candidate)
     cov = cov + np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_M**2] * 3)
     depth_scale = _depth_scale(fit, noises, candidate.T_body_cam0)
     return Verification(T, cov, fit.matches, fit.inliers, depth_scale)
@@ -221,7 +230,7 @@ def _best_fit(fits: list[_PoseFit]) -> _PoseFit:
         if other.inliers > _COMPETING_SHARE * best.inliers and _poses_differ(
             best.T, other.T, _median_depth(best.inliers_q, best.inliers_c)
         ):
-            raise _RefusedError(f"two poses fit: {best.inliers} and {other.inliers} inliers")
+            raise _RefusedError(f"two poses fit: {best.inliers} and {other.inliers} inliers", [best, other])
     return best
 
 
@@ -288,19 +297,27 @@ def _check_spread(y: F64, side: str) -> None:
         )
 
 
-def _check_uncertainty(cov: F64) -> None:
+def _check_uncertainty(fit: _PoseFit) -> None:
     """Refuse an uncertain pose; most wrong poses that pass the other checks fail here."""
-    degrees = float(np.degrees(se3.rotation_sigma(cov)))
+    degrees = float(np.degrees(se3.rotation_sigma(fit.cov)))
     if degrees > MAX_SIGMA_DEG:
-        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {MAX_SIGMA_DEG:.2f}° allowed")
+        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {MAX_SIGMA_DEG:.2f}° allowed", [fit])
 
 
-def _check_gravity(T_c_q: F64, query: CameraView, candidate: CameraView) -> None:
-    up_q, up_c = (view.T_body_cam0[:3, :3].T @ view.up for view in (query, candidate))
-    cosine = float((T_c_q[:3, :3] @ up_q) @ up_c / (np.linalg.norm(up_q) * np.linalg.norm(up_c)))
-    degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+def _require_upright(T_c_q: F64, query: CameraView, candidate: CameraView) -> None:
+    """Refuse a pose of the bodies that contradicts gravity, where both directions are known."""
+    degrees = gravity_difference_deg(T_c_q, query, candidate)
     if degrees > GRAVITY_DEG:
         raise _RefusedError(f"gravity differs by {degrees:.1f}°, {GRAVITY_DEG:.1f}° allowed")
+
+
+def gravity_difference_deg(T_c_q: F64, query: CameraView, candidate: CameraView) -> float:
+    """Return the angle between the two gravity directions if the bodies stand so; 0 where one is unknown."""
+    lengths = float(np.linalg.norm(query.up) * np.linalg.norm(candidate.up))
+    if lengths == 0:
+        return 0.0
+    cosine = float((T_c_q[:3, :3] @ query.up) @ candidate.up) / lengths
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _between_bodies(T_c_q: F64, cov: F64, T_body_cam_q: F64, T_body_cam_c: F64) -> tuple[F64, F64]:

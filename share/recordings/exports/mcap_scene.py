@@ -16,12 +16,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from share.colours import agent_colour
 from share.errors import DataError
 from share.files.writing import new_file, write_errors
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.recordings.convert import intact_measurements
-from share.recordings.exports.scene import COLOURS, Progress, Scene, SceneAgent, plain_names
+from share.recordings.exports.scene import Progress, Scene, SceneAgent, plain_names
 from share.recordings.images import EncodedImage
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.message_writer import MessageWriter
@@ -143,7 +144,7 @@ def _pose_stamped(frame: str, T: F64, stamp_ns: int) -> Any:
 
 def _point_cloud(scene: Scene, frame: str, stamp_ns: int) -> Any:
     """Return the points of all views as a PointCloud2: x, y, z, rgb."""
-    colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(scene.agents)}
+    colours = {name: agent_colour(k) for k, name in enumerate(scene.agents)}
     clouds = []
     for view in scene.views:
         cloud = np.zeros(len(view.points), _POINT)

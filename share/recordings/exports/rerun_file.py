@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from share.colours import agent_colour
 from share.errors import ShareError, install_hint
 from share.files.writing import check_replaceable
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.recordings.exports.scene import COLOURS, Progress, Scene, SceneAgent, SceneView, plain_names
+from share.recordings.exports.scene import Progress, Scene, SceneAgent, SceneView, plain_names
 from share.types import F64
 
 _TIMELINE = "stamp"
@@ -48,7 +49,7 @@ def write_rerun(scenes: Sequence[Scene], out: Path, progress: Progress) -> None:
 def _log_scene(rr: Any, recording: Any, scene: Scene, root: str, progress: Progress) -> None:
     recording.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     names = plain_names(list(scene.agents))
-    colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(scene.agents)}
+    colours = {name: agent_colour(k) for k, name in enumerate(scene.agents)}
     for name, agent in scene.agents.items():
         entity = f"{root}/{names[name]}"
         _log_agent(rr, recording, agent, entity, colours[name])

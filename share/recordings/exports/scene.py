@@ -15,10 +15,6 @@ from share.recordings.trajectory import Trajectory
 from share.types import F32, F64
 
 Progress = Callable[[int], None]
-COLOURS: tuple[tuple[int, int, int], ...] = (  # matplotlib's tab10: one per agent, in order
-    (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189),
-    (140, 86, 75), (227, 119, 194), (127, 127, 127), (188, 189, 34), (23, 190, 207),
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

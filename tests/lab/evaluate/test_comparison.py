@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from share.lab.evaluate.report import markdown
+from share.lab.evaluate.policy_report import best_in_bold, latex_table, markdown
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.statistics import (
     MEASURES,
@@ -121,3 +121,38 @@ def test_means_with_no_larger_error_are_counted():
 def test_policies_keep_their_order_and_every_measure_has_a_name():
     assert policy_names(RUNS) == ["covins-g", "share"]
     assert len({measure.name for measure in MEASURES}) == len(MEASURES)
+
+
+def test_a_report_begins_with_a_sentence_and_has_one_quantity_a_cell():
+    text = markdown(RUNS, TRIALS, "covins-g")
+    headline = text.split("\n\n")[1]
+    assert headline.startswith("**`share`: AR latency 15 ms, 0.60 of `covins-g`'s; merges per metre 0.75")
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [cell.strip() for line in rows for cell in line.split("|")[1:-1]]
+    assert not any(";" in cell for cell in cells)
+    assert "AR QoE" not in text  # nobody has one
+    assert "| AR latency, ms | 183 | **15** |" in text
+    assert "| robot ATE in the map | 1.50 | – | 1 of 2 |" in text  # over two sessions there are intervals
+    assert "| two | bot | **2** | – |" not in text and "| two | bot | 2 | – |" in text
+
+
+def test_with_one_session_there_is_no_interval_anywhere():
+    text = markdown(RUNS[:2], TRIALS, "covins-g")
+    assert "95 %" not in text
+    assert "| AR latency | 0.50 |" in text
+
+
+def test_the_best_is_bold_unless_all_are_equal_or_none_is_better():
+    assert best_in_bold([2.0, 1.0, NAN], -1) == ["2", "**1**", "–"]
+    assert best_in_bold([2.0, 1.0], 1) == ["**2**", "1"]
+    assert best_in_bold([2.0, 1.0], 0) == ["2", "1"]
+    assert best_in_bold([2.0, 2.0], -1) == ["2", "2"]
+    assert best_in_bold([2.0, NAN], -1) == ["2", "–"]
+
+
+def test_the_table_in_latex_has_the_same_values():
+    text = latex_table(RUNS, "covins-g")
+    assert "AR latency, ms & 183 & \\textbf{15} \\\\" in text
+    assert text.count("\\begin{tabular}{lrr}") == text.count("\\end{tabular}") == 1
+    rows = [line for line in text.splitlines() if "&" in line]
+    assert {line.count("&") for line in rows} == {2}

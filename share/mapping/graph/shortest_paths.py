@@ -1,0 +1,122 @@
+"""Shortest paths in a graph whose edges come and go."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.types import F64, I64
+
+_FURTHEST = 1e300  # a cost that no path has; below that of a removed edge
+_MOST_GONE = 0.1  # share of removed edges in the arrays
+_WIDER = 8.0  # factor on the cost up to which a search goes, until it reaches its goals
+
+
+class ShortestPaths:
+    """Shortest paths (Dijkstra 1959) among n poses with E undirected edges: ends a, b (E,), cost (E,).
+
+    An edge is known by its index, by default its position.
+    """
+
+    def __init__(self, n: int, a: I64, b: I64, cost: F64, index: I64 | None = None) -> None:
+        # Edges in both directions, sorted by start:
+        self._starts, self._targets = np.zeros(n + 1, np.int32), np.zeros(0, np.int32)
+        self._edge_index, self._cost = np.zeros(0, np.int64), np.zeros(0)
+        self._gone_count = 0  # removed edges that are still in the arrays, at an infinite cost
+        self._last_reach = _FURTHEST
+        self.add(n, a, b, cost, np.arange(len(a)) if index is None else index)
+
+    def add(self, n: int, a: I64, b: I64, cost: F64, index: I64) -> None:
+        """Add edges with these indices. n: number of poses with theirs."""
+        start, target = np.concatenate([a, b]), np.concatenate([b, a])
+        order = np.argsort(start, kind="stable")
+        start, both = start[order], np.concatenate([index, index])[order]
+        starts = np.concatenate([self._starts, np.full(n + 1 - len(self._starts), self._starts[-1])])
+        at = starts[start + 1]
+        self._targets = np.insert(self._targets, at, target[order])
+        self._edge_index = np.insert(self._edge_index, at, both)
+        self._cost = np.insert(self._cost, at, _positive(np.concatenate([cost, cost])[order]))
+        self._set_starts(starts + np.concatenate([[0], np.cumsum(np.bincount(start, minlength=n))]))
+
+    def remove(self, a: I64, b: I64, index: I64) -> None:
+        """Remove the edges with these ends and indices: no path uses them, and when many are gone they leave
+        the arrays."""
+        for u, edge in [*zip(a, index, strict=True), *zip(b, index, strict=True)]:
+            row = slice(self._starts[u], self._starts[u + 1])
+            self._cost[row][self._edge_index[row] == edge] = np.inf
+        self._graph.data = self._cost
+        self._gone_count += 2 * len(index)
+        if self._gone_count > _MOST_GONE * len(self._cost):
+            self._keep(np.isfinite(self._cost))
+            self._gone_count = 0
+
+    def _keep(self, is_left: NDArray[np.bool_]) -> None:
+        before = np.concatenate([[0], np.cumsum(is_left)])
+        self._targets, self._edge_index = self._targets[is_left], self._edge_index[is_left]
+        self._cost = self._cost[is_left]
+        self._set_starts(before[self._starts])
+
+    def set_cost(self, cost: F64) -> None:
+        """Change the cost (E,) of the edges, by index."""
+        self._cost = _positive(cost[self._edge_index])
+        self._graph.data = self._cost
+
+    def predecessors(self, start: int) -> I64:
+        """Return the pose before each (n,) on its path from `start`; negative for the start and unreachable
+        ones.
+        """
+        from scipy.sparse.csgraph import dijkstra
+
+        found = dijkstra(self._graph, indices=start, return_predecessors=True, limit=_FURTHEST)
+        return np.asarray(found[1], np.int64)
+
+    def predecessors_of(self, start: int, goals: I64) -> I64:
+        """Return the same, negative too for poses that are further away than all goals.
+
+        What is near is found at a cost that does not grow with the graph.
+        """
+        from scipy.sparse.csgraph import dijkstra
+
+        reach = self._last_reach
+        while True:
+            cost, before = dijkstra(self._graph, indices=start, return_predecessors=True, limit=reach)
+            furthest = cost[goals].max(initial=0.0)
+            if np.isfinite(furthest) or reach == _FURTHEST:
+                break
+            is_most = np.isfinite(cost).sum() > len(cost) / _WIDER
+            reach = _FURTHEST if is_most else _WIDER * reach
+        if np.isfinite(furthest) and furthest > 0:
+            self._last_reach = 2 * float(furthest)
+        return np.asarray(before, np.int64)
+
+    def cheapest_edges(self, u: I64, v: I64) -> I64:
+        """Return the index (K,) of the cheapest edge between each pair of neighbours u, v (K,)."""
+        count = self._starts[u + 1] - self._starts[u]
+        first = np.cumsum(count) - count
+        all_of_u = np.arange(count.sum()) + np.repeat(self._starts[u] - first, count)
+        arrives = self._targets[all_of_u] == np.repeat(v, count)
+        fits, pair = all_of_u[arrives], np.repeat(np.arange(len(u)), count)[arrives]
+        order = np.lexsort((self._cost[fits], pair))
+        first_of_pair = order[np.searchsorted(pair[order], np.arange(len(u)))]
+        return np.asarray(self._edge_index[fits[first_of_pair]], np.int64)
+
+    def _set_starts(self, starts: I64) -> None:
+        from scipy.sparse import csr_array
+
+        self._starts, n = starts.astype(np.int32), len(starts) - 1
+        self._graph = csr_array((self._cost, self._targets, self._starts), shape=(n, n))
+
+
+def _positive(cost: F64) -> F64:
+    return np.asarray(np.maximum(cost, 1e-300))  # zero would mean no edge
+
+
+def poses_on_paths(predecessors: I64, goals: I64) -> I64:
+    """Return all poses on the paths to `goals`, ascending; the goals are included, the start is not."""
+    is_visited = np.zeros(len(predecessors), bool)
+    frontier = goals[predecessors[goals] >= 0]
+    while len(frontier):
+        is_visited[frontier] = True
+        frontier = predecessors[frontier]
+        frontier = frontier[(predecessors[frontier] >= 0) & ~is_visited[frontier]]
+    return np.flatnonzero(is_visited)

@@ -1,0 +1,90 @@
+"""Whether the room can serve one more agent: what it would do to the delay of headsets.
+
+All send at their least rates; beyond the tolerated delay nothing is left to yield. Robots leave first: a
+headset that finds no room takes the place of robots, and is refused where that is not enough.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from statistics import median
+
+from share.scheduling.room_budget import LEAST_HZ, MAX_LOAD, POSE_COST, SCARCE_POSE_HZ, RoomBudget
+from share.timing import seconds_to_ns
+from share.types import AgentKind
+
+TOLERATED_DELAY_MS = 200.0  # of a headset's corrections; more is shown as its trouble
+_LIMIT = f"{TOLERATED_DELAY_MS:.0f} ms"
+_MUCH_MS = 10_000.0
+_SETTLED_S = 10.0  # for so long the room must have been full: a pause of the edge or of the air is none
+
+
+@dataclass(frozen=True)
+class RoomCapacity:
+    """What the room could still take when it was last looked at. delay_ms: of headsets with one more agent,
+    by its form. full_since_ns: since when that has been too much. leaving: robots that would make room for
+    one more headset, by name, the newest first; leaving_since_ns: since when there have been any."""
+
+    delay_ms: Mapping[AgentKind, float] = field(default_factory=dict)
+    full_since_ns: Mapping[AgentKind, int] = field(default_factory=dict)
+    leaving: tuple[str, ...] = ()
+    leaving_since_ns: int | None = None
+
+    def looked_at(self, budget: RoomBudget, now_ns: int) -> RoomCapacity:
+        """Return what the room can take now."""
+        robots = [name for name, one in budget.agents.items() if one.terms.form is AgentKind.ROBOT]
+        has_headset = len(robots) < len(budget.agents)
+        leaving = list[str]()
+        headset_ms = headset_delay_ms(budget, AgentKind.AR)
+        while headset_ms > TOLERATED_DELAY_MS and robots:
+            leaving.append(robots.pop())
+            headset_ms = headset_delay_ms(budget, AgentKind.AR, leaving)
+        robot_ms = headset_delay_ms(budget, AgentKind.ROBOT) if has_headset else 0.0
+        delay_ms = {AgentKind.AR: headset_ms, AgentKind.ROBOT: robot_ms}
+        full_since_ns = {
+            form: self.full_since_ns.get(form, now_ns)
+            for form, ms in delay_ms.items()
+            if ms > TOLERATED_DELAY_MS
+        }
+        before_ns = now_ns if self.leaving_since_ns is None else self.leaving_since_ns
+        return RoomCapacity(delay_ms, full_since_ns, tuple(leaving), before_ns if leaving else None)
+
+    def objection(self, form: AgentKind, now_ns: int) -> str | None:
+        """Return why the room cannot serve one more agent of a form, for a person; None if it can."""
+        if not _is_settled(self.full_since_ns.get(form), now_ns):
+            return None
+        kind = "headset" if form is AgentKind.AR else "robot"
+        ms = self.delay_ms[form]
+        how_long = f"{ms:.0f} ms" if ms < _MUCH_MS else "seconds"
+        return f"no air for one more {kind}: corrections of headsets would take {how_long}, {_LIMIT} at most"
+
+    def displaced(self, form: AgentKind, now_ns: int) -> tuple[str, ...]:
+        """Return the robots that have to leave for one more agent of a form."""
+        is_crowded = form is AgentKind.AR and _is_settled(self.leaving_since_ns, now_ns)
+        return self.leaving if is_crowded else ()
+
+
+def headset_delay_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[str] = ()) -> float:
+    """Return the delay of headsets once one agent has joined and others have left, all at their least rates;
+    inf beyond what the air carries, 0 in an empty room, of which nothing is known."""
+    if not budget.agents:
+        return 0.0
+    staying = [agent for name, agent in budget.agents.items() if name not in leaving]
+    air_s = median(map(budget.air_s, budget.agents.values()))
+    load = air_s * sum(map(_least_hz, [joining, *(agent.terms.form for agent in staying)]))
+    if load >= MAX_LOAD:
+        return math.inf
+    headsets = [agent for agent in staying if agent.terms.form is AgentKind.AR]
+    elsewhere_ms = median(one.elsewhere_ms for one in headsets or budget.agents.values())
+    return elsewhere_ms + 1e3 * air_s / (1 - load)
+
+
+def _least_hz(form: AgentKind) -> float:
+    """Return keyframes a second of an agent at its least rate, poses included."""
+    return LEAST_HZ[form] + POSE_COST * SCARCE_POSE_HZ[form]
+
+
+def _is_settled(since_ns: int | None, now_ns: int) -> bool:
+    return since_ns is not None and now_ns - since_ns >= seconds_to_ns(_SETTLED_S)

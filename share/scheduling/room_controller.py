@@ -1,0 +1,111 @@
+"""The room of one edge over time: what each agent may send, when it begins, and whether one more has room."""
+
+from __future__ import annotations
+
+from share.scheduling.qoe import QoeParameters
+from share.scheduling.room_budget import SILENT_S, AgentAir, RateGrant, RoomBudget, first_grant
+from share.scheduling.room_capacity import RoomCapacity
+from share.scheduling.staggered_start import UNKNOWN_KEYFRAME_S, StaggeredStart
+from share.timing import seconds_to_ns
+from share.types import AgentKind
+from share.wire.messages import Evaluation
+
+_PERIOD_NS = 500_000_000  # between two allocations
+_SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
+_STARTING_NS = 10_000_000_000  # who has not sent them by then takes no part from others
+_STARTING_LOAD = 0.5  # of the air, for all that begin
+
+
+class RoomController:
+    """The budget of one edge over time. Counts are of messages that have arrived so far."""
+
+    def __init__(self) -> None:
+        self._budget = RoomBudget()
+        self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
+        self._grants: dict[str, RateGrant] = {}
+        self._allocated_ns = 0
+        self._start = StaggeredStart()
+        self._starting: dict[str, int] = {}  # agents whose air is not known, and when they joined
+        self._capacity, self._looked_ns = RoomCapacity(), 0
+
+    def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
+        """Return what an agent may send whose air is not known: its part of what all that begin have."""
+        self._starting = {n: at for n, at in self._starting.items() if now_ns - at < _STARTING_NS}
+        air_s = self._budget.longest_air_s or UNKNOWN_KEYFRAME_S
+        hz = _STARTING_LOAD / (air_s * max(1, len(self._starting)))
+        return first_grant(form, hz)
+
+    def hold_ms(self, name: str, now_ns: int) -> float:
+        """Return how long an agent that joins now holds its keyframes, ms."""
+        self._starting[name] = now_ns
+        return self._start.hold_ms(self._budget.longest_air_s, now_ns)
+
+    def grant(
+        self,
+        name: str,
+        terms: QoeParameters,
+        wanted_hz: float,
+        evaluation: Evaluation,
+        air_ms: float,
+        counts: tuple[int, int],
+        now_ns: int,
+        is_placed: bool = True,
+    ) -> RateGrant:
+        """Return what an agent may send, by its evaluation. air_ms: A. counts: its keyframes and poses so
+        far. is_placed: see `AgentAir`."""
+        hz, pose_hz = self._rates(name, counts, now_ns)
+        reported = AgentAir(
+            terms=terms,
+            wanted_hz=wanted_hz,
+            keyframe_s=air_ms / 1e3,
+            delay_ms=evaluation.delay_ms,
+            error_cm=evaluation.error_cm,
+            drift_cm=evaluation.drift_cm,
+            hz=hz,
+            pose_hz=pose_hz,
+            updated_ns=now_ns,
+            is_placed=is_placed,
+        )
+        self._budget = self._budget.with_report(name, reported)
+        self._look_at_capacity(now_ns)
+        if counts[0] < _SLOW_START_KEYFRAMES:
+            return self.first_grant(terms.form, now_ns)
+        self._starting.pop(name, None)
+        if not self._budget.is_short:
+            self._grants = {}
+            return RateGrant(wanted_hz)
+        if name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
+            self._grants, self._allocated_ns = self._budget.allocate(), now_ns
+        return self._grants[name]
+
+    def objection(self, form: AgentKind, now_ns: int) -> str | None:
+        """Return why the room cannot serve one more agent of a form, for a person; None if it can."""
+        return self._recent_capacity(now_ns).objection(form, now_ns)
+
+    def displaced(self, form: AgentKind, now_ns: int) -> tuple[str, ...]:
+        """Return the robots that have to leave for one more agent of a form, by name."""
+        return self._recent_capacity(now_ns).displaced(form, now_ns)
+
+    def _look_at_capacity(self, now_ns: int) -> None:
+        if now_ns - self._looked_ns >= _PERIOD_NS:
+            self._capacity, self._looked_ns = self._capacity.looked_at(self._budget, now_ns), now_ns
+
+    def _recent_capacity(self, now_ns: int) -> RoomCapacity:
+        """Return the capacity, a new one where nobody reports any more."""
+        return self._capacity if now_ns - self._looked_ns < seconds_to_ns(SILENT_S) else RoomCapacity()
+
+    def forget(self, name: str) -> None:
+        """Drop an agent."""
+        self._budget = self._budget.without(name)
+        for kept in (self._counts, self._grants, self._starting):
+            kept.pop(name, None)
+
+    def _rates(self, name: str, counts: tuple[int, int], now_ns: int) -> tuple[float, float]:
+        """Return keyframes and poses a second since the agent's last report."""
+        since_ns, before = self._counts.get(name, (now_ns, counts))
+        self._counts[name] = now_ns, counts
+        elapsed_s = (now_ns - since_ns) / 1e9
+        if elapsed_s <= 0:
+            return 0.0, 0.0
+        hz, pose_hz = ((now - then) / elapsed_s for now, then in zip(counts, before, strict=True))
+        return hz, pose_hz

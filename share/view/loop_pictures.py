@@ -1,0 +1,71 @@
+"""What the two keyframes of a loop saw: small pictures, kept of the newest keyframes, and which loop is meant
+by a click."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from share.errors import DataError
+from share.mapping.loops import KeyframeKey
+from share.types import F64, U8
+from share.vision.image_codec import decode_gray
+
+_KEPT = 3000  # pictures; 10 kB each
+_WIDTH_PX, _QUALITY = 320, 70
+_MOST_ANGLE_RAD = 0.05  # between a click's ray and a loop
+
+
+@dataclass(frozen=True)
+class LoopViews:
+    """The two views of a loop: who saw them, and JPEGs; empty where they are kept no longer."""
+
+    titles: tuple[str, str]
+    jpegs: tuple[bytes, bytes]
+
+
+class KeyframePictures:
+    """Small pictures of the newest keyframes."""
+
+    def __init__(self) -> None:
+        self._jpegs: OrderedDict[KeyframeKey, bytes] = OrderedDict()
+
+    def add(self, key: KeyframeKey, jpeg: bytes) -> None:
+        """Keep a keyframe's picture; one that cannot be decoded is left out."""
+        if (small := shrunk(jpeg, _WIDTH_PX)) is None:
+            return
+        is_done, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        if is_done:
+            self._jpegs[key] = data.tobytes()
+            if len(self._jpegs) > _KEPT:
+                self._jpegs.popitem(last=False)
+
+    def remove(self, key: KeyframeKey) -> None:
+        self._jpegs.pop(key, None)
+
+    def get(self, key: KeyframeKey) -> bytes:
+        return self._jpegs.get(key, b"")
+
+
+def shrunk(jpeg: bytes, width: int) -> U8 | None:
+    """Return a JPEG as a small gray image (h, width); None if it cannot be decoded."""
+    try:
+        image = decode_gray(jpeg, "image")
+    except DataError:
+        return None
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def nearest_to_ray(points: F64, origin: F64, direction: F64) -> int | None:
+    """Return which of points (N, 3) is nearest to a ray, seen from its origin; None if none is near."""
+    if not len(points):
+        return None
+    away = points - origin
+    along = away @ (direction / np.linalg.norm(direction))
+    angle = np.arccos(np.clip(along / np.maximum(np.linalg.norm(away, axis=1), 1e-9), -1, 1))
+    best = int(np.argmin(angle))
+    return best if angle[best] < _MOST_ANGLE_RAD else None

@@ -1,0 +1,86 @@
+"""Whether the room can serve one more agent."""
+
+from __future__ import annotations
+
+import pytest
+
+from share.config import ControlConfig
+from share.scheduling.qoe import QoeParameters
+from share.scheduling.room_budget import AgentAir, RoomBudget
+from share.scheduling.room_capacity import TOLERATED_DELAY_MS, RoomCapacity, headset_delay_ms
+from share.scheduling.room_controller import RoomController
+from share.types import AgentKind
+from share.wire.messages import Evaluation
+
+S = 1_000_000_000
+AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
+TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in (AR, ROBOT)}
+KEYFRAME_MS = 54.0  # at 5 Mbit/s
+
+
+def room(headsets: int, robots: int, keyframe_ms: float = KEYFRAME_MS) -> RoomBudget:
+    def agent(kind: AgentKind) -> AgentAir:
+        times = {"keyframe_s": keyframe_ms / 1e3, "delay_ms": 60 + keyframe_ms}
+        return AgentAir(
+            TERMS[kind], wanted_hz=1.5, error_cm=1.0, drift_cm=0.5, hz=0.0, pose_hz=0.0, updated_ns=0, **times
+        )
+
+    kinds = [AR] * headsets + [ROBOT] * robots
+    return RoomBudget({f"{kind}{k}": agent(kind) for k, kind in enumerate(kinds)})
+
+
+def settled(budget: RoomBudget) -> RoomCapacity:
+    return RoomCapacity().looked_at(budget, 0).looked_at(budget, 10 * S)
+
+
+def test_a_room_with_air_takes_everyone() -> None:
+    for budget in (RoomBudget(), room(8, 4), room(20, 10, keyframe_ms=5.0)):
+        capacity = settled(budget)
+        assert [capacity.objection(kind, 10 * S) for kind in AgentKind] == [None, None]
+        assert capacity.displaced(AR, 10 * S) == ()
+
+
+def test_robots_leave_first_the_newest_before_others() -> None:
+    budget = room(18, 6)
+    assert headset_delay_ms(budget, AR) > TOLERATED_DELAY_MS
+    capacity = settled(budget)
+    assert capacity.objection(AR, 10 * S) is None
+    assert "one more robot" in str(capacity.objection(ROBOT, 10 * S))
+    assert capacity.displaced(AR, 10 * S)[0] == "robot23"
+    assert set(capacity.displaced(AR, 10 * S)) < {f"robot{k}" for k in range(18, 24)}
+    assert headset_delay_ms(budget, AR, capacity.displaced(AR, 10 * S)) <= TOLERATED_DELAY_MS
+    assert capacity.displaced(ROBOT, 10 * S) == ()
+
+
+def test_a_room_full_of_headsets_says_so() -> None:
+    capacity = settled(room(23, 0))
+    said = str(capacity.objection(AR, 10 * S))
+    assert said.startswith("no air for one more headset: corrections of headsets would take ")
+    assert said.endswith(f"{TOLERATED_DELAY_MS:.0f} ms at most")
+    assert "seconds" in str(settled(room(60, 0)).objection(AR, 10 * S))
+
+
+def test_a_short_pause_refuses_nobody() -> None:
+    full, free = room(23, 0), room(8, 4)
+    capacity = RoomCapacity().looked_at(full, 0)
+    assert capacity.objection(AR, 9 * S) is None
+    recovered = capacity.looked_at(free, 9 * S).looked_at(full, 10 * S)
+    assert recovered.objection(AR, 19 * S) is None
+    assert recovered.objection(AR, 20 * S) is not None
+
+
+def test_robots_alone_refuse_no_robot() -> None:
+    assert settled(room(0, 60)).objection(ROBOT, 10 * S) is None
+
+
+@pytest.mark.parametrize("gone_s", [1.0, 60.0])
+def test_a_room_that_all_have_left_is_not_full(gone_s: float) -> None:
+    controller, told = RoomController(), Evaluation(0, 1050.0, 1.0, 10.0, 5.0, 800.0, 0.5)
+    for k in range(400):
+        counts = 9 + k // 20, k
+        controller.grant(f"a{k % 20}", TERMS[AR], 1.5, told, 800.0, counts, k * S // 20)
+    assert controller.objection(AR, 20 * S) is not None
+    if gone_s < 3:
+        assert controller.objection(AR, round((20 + gone_s) * S)) is not None
+    else:
+        assert controller.objection(AR, round((20 + gone_s) * S)) is None

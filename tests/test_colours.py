@@ -1,0 +1,34 @@
+"""Colours: one of each agent and policy, wherever it is drawn."""
+
+from __future__ import annotations
+
+from share.colours import (
+    AGENT_COLOURS,
+    POLICY_COLOURS,
+    agent_colour,
+    agent_colours,
+    hex_colour,
+    series_colours,
+)
+from share.config import POLICY_NAMES
+from share.runtime.status_page import PAGE
+
+
+def test_every_policy_has_a_colour_of_its_own() -> None:
+    assert set(POLICY_COLOURS) == set(POLICY_NAMES)
+    assert len(set(POLICY_COLOURS.values())) == len(POLICY_COLOURS)
+    assert len(set(AGENT_COLOURS)) == len(AGENT_COLOURS)
+
+
+def test_a_policy_keeps_its_colour_whoever_stands_beside_it() -> None:
+    alone, beside = series_colours(["share"]), series_colours(["basalt", "linear", "share"])
+    assert alone["share"] == beside["share"] == hex_colour(POLICY_COLOURS["share"])
+    assert beside["basalt"] == series_colours(["basalt", "openvins"])["basalt"]
+
+
+def test_agents_are_coloured_in_order_and_the_page_does_the_same() -> None:
+    colours = agent_colours(["ann", "bob"])
+    assert colours == {"ann": hex_colour(agent_colour(0)), "bob": hex_colour(agent_colour(1))}
+    assert agent_colour(len(AGENT_COLOURS)) == agent_colour(0)
+    assert all(hex_colour(colour) in PAGE for colour in AGENT_COLOURS)
+    assert "%COLOURS%" not in PAGE

@@ -1,0 +1,98 @@
+"""A click on a loop shows what its two keyframes saw."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from share.mapping.loops import KeyframeKey
+from share.types import AgentKind
+from share.view import drawing as dr
+from share.view import events as ev
+from share.view import loop_pictures
+from share.view.loop_pictures import KeyframePictures, nearest_to_ray
+from share.view.room import Room
+
+
+def jpeg(shade: int, width: int = 640) -> bytes:
+    return cv2.imencode(".jpg", np.full((width * 3 // 4, width), shade, np.uint8))[1].tobytes()
+
+
+def shade_of(data: bytes) -> tuple[float, tuple[int, ...]]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return float(image.mean()), image.shape
+
+
+def keyframe(name: str, id_: int, x: float, shade: int) -> ev.KeyframeShown:
+    T = np.eye(4)
+    T[0, 3] = x
+    return ev.KeyframeShown(
+        KeyframeKey(f"{name}-1", id_), id_ == 0, T, np.zeros((0, 3), np.float32), jpeg(shade)
+    )
+
+
+@pytest.fixture
+def room() -> Room:
+    """Ann's keyframes at x = 0 and 4, bob's at 0.5 and 4.5, and a loop of each pair."""
+    room = Room()
+    for name, x, shades in (("ann", 0.0, (20, 60)), ("bob", 0.5, (120, 200))):
+        room.apply(ev.RunShown(f"{name}-1", name, AgentKind.AR, np.eye(4), (0.8, 0.6)), 0.0)
+        room.apply(keyframe(name, 0, x, shades[0]), 0.0)
+        room.apply(keyframe(name, 1, x + 4.0, shades[1]), 0.0)
+        room.apply(ev.CorrectionShown(f"{name}-1", "A", np.eye(4), 0), 0.0)
+    for id_ in (0, 1):
+        room.apply(ev.LoopAccepted(KeyframeKey("ann-1", id_), KeyframeKey("bob-1", id_)), 0.0)
+    return room
+
+
+ABOVE = np.array([0.25, 0.0, 5.0])
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def test_a_click_shows_both_views_of_the_loop_that_it_meets(room: Room) -> None:
+    for x, titles, shades in (
+        (0.25, ("ann, keyframe 0", "bob, keyframe 0"), (20, 120)),
+        (4.25, ("ann, keyframe 1", "bob, keyframe 1"), (60, 200)),
+    ):
+        views = room.loop_at(np.array([x, 0.0, 5.0]), DOWN)
+        assert views is not None and views.titles == titles
+        for data, shade in zip(views.jpegs, shades, strict=True):
+            assert shade_of(data) == (pytest.approx(shade, abs=2), (240, 320))
+
+
+def test_a_click_beside_all_loops_shows_nothing(room: Room) -> None:
+    assert room.loop_at(ABOVE, np.array([0.0, 1.0, 0.0])) is None
+    assert Room().loop_at(ABOVE, DOWN) is None
+
+
+def test_loops_have_marks_to_click_until_they_are_removed(room: Room) -> None:
+    (marks,) = [one for one in room.take_drawings(0.0) if isinstance(one, dr.Marks)]
+    assert np.allclose(marks.positions[:, 0], [0.25, 4.25])
+    room.apply(ev.LoopsRemoved(KeyframeKey("ann-1", 0), KeyframeKey("bob-1", 0)), 0.0)
+    (marks,) = [one for one in room.take_drawings(0.0) if isinstance(one, dr.Marks)]
+    assert np.allclose(marks.positions[:, 0], [4.25])
+    room.apply(ev.LoopsRemoved(KeyframeKey("ann-1", 1), KeyframeKey("bob-1", 1)), 0.0)
+    assert dr.Removed(marks.name) in room.take_drawings(0.0)
+
+
+def test_a_picture_that_is_gone_is_said_to_be(room: Room) -> None:
+    room.apply(ev.KeyframesRemoved((KeyframeKey("ann-1", 0),)), 0.0)
+    assert room.loop_at(ABOVE, DOWN) is None  # with its loop
+
+
+def test_pictures_are_bounded_and_damaged_ones_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_pictures, "_KEPT", 3)
+    pictures = KeyframePictures()
+    keys = [KeyframeKey("ann-1", k) for k in range(5)]
+    for k, key in enumerate(keys):
+        pictures.add(key, jpeg(10 * k) if k != 1 else b"no image")
+    assert [bool(pictures.get(key)) for key in keys] == [False, False, True, True, True]
+
+
+def test_the_nearest_by_angle_is_meant() -> None:
+    points = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 10.0], [0.0, 0.0, -5.0]])
+    ray = np.array([0.03, 0.0, 1.0])
+    assert nearest_to_ray(points, np.zeros(3), ray) == 1
+    assert nearest_to_ray(points, np.zeros(3), np.array([1.0, 0.0, 0.0])) is None
+    assert nearest_to_ray(np.zeros((0, 3)), np.zeros(3), ray) is None

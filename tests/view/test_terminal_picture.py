@@ -1,0 +1,90 @@
+"""The room as text: what is said of agents, and where they are on the plan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+import pytest
+
+from share.view.terminal_picture import TerminalPicture
+
+COLUMNS, ROWS = 100, 24
+
+
+def agent(kind: str = "ar", pose_ms: float | None = 6.0, **more: Any) -> dict[str, Any]:
+    return {
+        **{"kind": kind, "state": "OK", "pose_ms": pose_ms, "qoe": 0.8, "qoe_target": 0.75},
+        **{"rate_hz": 3.2, "keyframes": 12, "gone": False, "trouble": []},
+        **more,
+    }
+
+
+def place(
+    path: list[list[float]], map_id: str = "a", kind: str = "ar", heading: float = 0.0
+) -> dict[str, Any]:
+    parts = [{"map_id": map_id, "path": path}]
+    return {"kind": kind, "map_id": map_id, "parts": parts, "position": path[-1], "heading": heading}
+
+
+EAST = [[0.1 * k, 0.0] for k in range(50)]
+NORTH = [[0.0, 0.1 * k] for k in range(30)]
+
+
+def drawn(
+    report: dict[str, Any], plan: dict[str, Any], columns: int = COLUMNS, rows: int = ROWS
+) -> list[str]:
+    return [click.unstyle(line) for line in TerminalPicture().lines(report, plan, columns, rows)]
+
+
+def test_a_line_says_how_an_agent_fares() -> None:
+    (line,) = drawn({"agents": {"ann": agent()}}, {"agents": {}})
+    for text in ("ann", "ar", "OK", "6.0 of  20 ms", "QoE 0.80 (0.75)", "3.2 Hz", "12 key"):
+        assert text in line
+    (robot,) = drawn({"agents": {"tom": agent("robot", None, qoe=None)}}, {"agents": {}})
+    assert "of 200 ms" in robot and "QoE    – (0.75)" in robot
+
+
+def test_late_poses_are_red_and_what_is_gone_is_left_out() -> None:
+    picture = TerminalPicture()
+    late = picture.lines({"agents": {"ann": agent(pose_ms=31.0)}}, {"agents": {}}, COLUMNS, ROWS)[0]
+    soon = TerminalPicture().lines({"agents": {"ann": agent()}}, {"agents": {}}, COLUMNS, ROWS)[0]
+    red = "\x1b[38;2;229;72;77m"
+    assert late.count(red) == 2 and red not in soon  # the figure, and the mark in its history
+    assert drawn({"agents": {"ann": agent(gone=True)}}, {"agents": {}}) == []
+
+
+def test_paths_and_agents_are_where_they_are() -> None:
+    plan = {"agents": {"ann": place(EAST), "tom": place(NORTH, kind="robot")}}
+    lines = drawn({"agents": {"ann": agent(), "tom": agent("robot")}}, plan)
+    top = next(k for k, line in enumerate(lines) if "● tom" in line)
+    right = next(k for k, line in enumerate(lines) if "→ ann" in line)
+    assert top < right  # north is up
+    assert lines[right].index("→ ann") > lines[top].index("● tom")
+    assert any("map of ann, tom" in line for line in lines)
+
+
+def test_maps_that_are_apart_stand_beside_each_other() -> None:
+    plan = {"agents": {"ann": place(EAST), "bob": place(NORTH, map_id="b")}}
+    lines = drawn({"agents": {"ann": agent(), "bob": agent()}}, plan)
+    caption = next(line for line in lines if "map of ann" in line)
+    assert caption.index("map of bob") >= COLUMNS // 2 - 1
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(72, 18), (100, 24), (200, 60), (72, 8)])
+def test_it_fits_the_terminal(columns: int, rows: int) -> None:
+    names = [f"agent-with-a-long-name-{k}" for k in range(9)]
+    report = {"agents": {name: agent(trouble=["pose 3 s late \x1b[2J"]) for name in names}}
+    plan = {"agents": {name: place(EAST, map_id=str(k)) for k, name in enumerate(names)}}
+    picture = TerminalPicture()
+    for _ in range(30):
+        coloured = picture.lines(report, plan, columns, rows)
+    lines = [click.unstyle(line) for line in coloured]
+    assert len(lines) <= rows
+    assert max(map(len, lines)) <= columns
+    assert not any("\x1b[2J" in line for line in coloured)  # of a peer's text
+
+
+def test_a_standing_agent_is_drawn() -> None:
+    lines = drawn({"agents": {"ann": agent()}}, {"agents": {"ann": place([[0.0, 0.0]])}})
+    assert any("→ ann" in line for line in lines)
