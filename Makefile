@@ -21,10 +21,11 @@ demo: .venv/for-demo  # without the developers' tools
 	@test -e .venv || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --disable-pip-version-check -e '.[emulate,view]'
 	touch $@
+WORKERS := $(shell expr 1 + $$(nproc))# one more than cores: many tests wait for a while
 unit: install  # the inner loop: what decides, without what takes a second or more
 	$(BIN)/pytest -n auto --maxprocesses 4 -m "not slow and not torture and not long" tests/geometry tests/vision tests/scheduling tests/metrics tests/wire tests/sensors tests/protocol tests/mapping tests/odometry
 test: install
-	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
+	$(BIN)/pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest -n auto --maxprocesses 2 --dist loadfile tests/run --ignore $(BUSY)  # real time: mostly waiting
 	$(BIN)/pytest $(BUSY)  # with the cores to itself
 BUSY := tests/run/test_kitchen.py# its processes fill two cores, and it asks how well clocks agree
