@@ -3,7 +3,7 @@
     python tools/experiments/measure_viewers.py SESSION [--rounds N] --out DIR
 
 Plays SESSION in real time once a round and setup, in another order each round, so that what else the machine
-does meets all setups alike. A viewer reads all that the live room sends. Prints a Markdown table of means, and
+does meets all setups alike. A viewer reads all that the live room sends. Prints a Markdown table of means and
 of differences from the setup without a live room in the same round (mean, standard error); writes
 viewers.json.
 """
