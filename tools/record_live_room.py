@@ -46,6 +46,9 @@ from share.view.viewer import LiveRoom  # noqa: E402
 MAX_BYTES = 1_900_000
 QUALITIES = (75, 65, 55, 45, 35, 25)  # the first whose file is small enough
 _POSES_HZ = 10.0
+_WITHOUT_NOTES = (  # what viser says of a browser without a graphics card
+    "document.querySelectorAll('[class*=Notification-root]').forEach(note => note.remove())"
+)
 _SETTLE_S = 0.35  # in which the page draws what it was sent
 
 
@@ -153,7 +156,8 @@ def pictures(session: Session, seconds: float, hz: float, width: int, height: in
         room.feed = live.feed
         live.feed.begin_session(None, [])
         with browser_page(f"http://{live.endpoint}/", width, height) as page:
-            time.sleep(5.0)
+            time.sleep(8.0)
+            page.evaluate(_WITHOUT_NOTES)
             poses_a_picture = max(1, round(_POSES_HZ / hz))
             for k in range(round(seconds * hz)):
                 for part in range(poses_a_picture):
@@ -165,9 +169,11 @@ def pictures(session: Session, seconds: float, hz: float, width: int, height: in
                 yield page.picture()
 
 
-def animation(pngs: list[bytes], milliseconds: int) -> bytes:
-    """Return an animated WebP, of the best quality that is small enough."""
+def animation(pngs: list[bytes], milliseconds: int, width: int) -> bytes:
+    """Return an animated WebP so many pixels wide, of the best quality that is small enough."""
     frames = [Image.open(io.BytesIO(one)).convert("RGB") for one in pngs]
+    size = width, round(frames[0].height * width / frames[0].width)
+    frames = [one.resize(size, Image.Resampling.LANCZOS) for one in frames]
     data = b""
     for quality in QUALITIES:
         out = io.BytesIO()
@@ -186,7 +192,8 @@ def main() -> None:
     parser.add_argument("--session", type=Path, help="in place of the demo's: a folder by `share emulate`")
     parser.add_argument("--hz", type=float, default=2.0, help="pictures a second")
     parser.add_argument("--speed", type=float, default=2.0, help="how much faster it is shown")
-    parser.add_argument("--size", default="960x600")
+    parser.add_argument("--size", default="1280x720", help="of the page")
+    parser.add_argument("--width", type=int, default=960, help="of the animation")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--keep", type=Path, help="folder for the pictures themselves")
     given = parser.parse_args()
@@ -200,7 +207,7 @@ def main() -> None:
         if given.keep is not None:
             given.keep.mkdir(parents=True, exist_ok=True)
             (given.keep / f"{len(pngs):04}.png").write_bytes(one)
-    data = animation(pngs, round(1000 / given.hz / given.speed))
+    data = animation(pngs, round(1000 / given.hz / given.speed), given.width)
     given.out.write_bytes(data)
     print(f"{given.out}: {len(pngs)} pictures, {len(data) / 1e6:.2f} MB")
 
