@@ -34,22 +34,16 @@ from websockets.sync.client import connect  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.lab.emulate.recipe import demo_recipe, meeting_seed  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
-from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
-from share.lab.evaluate.simulation import Simulation  # noqa: E402
-from share.lab.evaluate.virtual_time import session_members, track_session  # noqa: E402
-from share.protocol import edge_events as ed  # noqa: E402
+from share.lab.evaluate.shown_simulation import shown_simulation  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
-from share.view.feed import ViewFeed  # noqa: E402
 from share.view.viewer import LiveRoom  # noqa: E402
 
 MAX_BYTES = 1_900_000
 QUALITIES = (75, 65, 55, 45, 35, 25)  # the first whose file is small enough
-_POSES_HZ = 10.0
 _WITHOUT_NOTES = (  # what viser says of a browser without a graphics card
     "document.querySelectorAll('[class*=Notification-root]').forEach(note => note.remove())"
 )
-_SETTLE_S = 0.35  # in which the page draws what it was sent
+_POSES_SEEN_S, _SETTLE_S = 0.07, 0.35  # for the live room, which draws fifteen times a second; for the page
 
 
 # A browser
@@ -121,52 +115,24 @@ def _devtools_port(profile: Path) -> int:
 # The room
 
 
-class ShownSimulation(Simulation):
-    """A simulated room that tells a live room what happens, as `share.runtime.edge` does."""
-
-    feed: ViewFeed | None = None
-
-    def _to_edge(self, event: ed.EdgeEvent) -> None:
-        super()._to_edge(event)
-        if self.feed is not None and isinstance(event, ed.MapperResult):
-            self.feed.add_result(event)
-
-    def _edge_did(self, effect: ed.EdgeEffect) -> None:
-        if self.feed is not None:
-            self.feed.add_effect(effect)
-
-    def show_poses(self) -> None:
-        assert self.feed is not None
-        self.feed.add_poses(self.edge.latest_poses())
-
-    def show_report(self) -> None:
-        assert self.feed is not None
-        self.feed.add_report(self.edge.report(self.mapper.report()))
-
-
-def pictures(session: Session, seconds: float, hz: float, width: int, height: int) -> Iterator[bytes]:
-    """Yield pictures (PNG) of a session from its start to its end."""
-    settings = Config()
-    tracked = track_session(
-        session.folder, settings.tracker, settings.inertial, settings.sequencer, settings.agent.error_model
-    )
-    members = session_members(session, tracked, LinkAssignment.parse(None))
-    room = ShownSimulation(settings, members, ProcessingDelays(), seed=0)
+def pictures(session: Session, seconds: float, hz: float, width: int, height: int) -> list[bytes]:
+    """Return pictures (PNG) of a session from its start to its end."""
     with closing(LiveRoom("0", None, "SHARE edge")) as live:
-        room.feed = live.feed
-        live.feed.begin_session(None, [])
+        room = shown_simulation(session, Config(), live.feed)
         with browser_page(f"http://{live.endpoint}/", width, height) as page:
             time.sleep(8.0)
             page.evaluate(_WITHOUT_NOTES)
-            poses_a_picture = max(1, round(_POSES_HZ / hz))
-            for k in range(round(seconds * hz)):
-                for part in range(poses_a_picture):
-                    room.run((k + (part + 1) / poses_a_picture) / hz)
-                    room.show_poses()
-                    time.sleep(0.08)  # for the live room, which draws fifteen times a second
-                room.show_report()
-                time.sleep(_SETTLE_S)
-                yield page.picture()
+            taken = list[bytes]()
+
+            def take(t_s: float) -> None:
+                time.sleep(_POSES_SEEN_S)
+                if t_s >= (len(taken) + 1) / hz - 1e-6:
+                    time.sleep(_SETTLE_S)
+                    taken.append(page.picture())
+                    print(f"{len(taken)} of {round(seconds * hz)} pictures", end="\r", file=sys.stderr)
+
+            room.play(seconds, take)
+    return taken
 
 
 def animation(pngs: list[bytes], milliseconds: int, width: int) -> bytes:
@@ -200,13 +166,11 @@ def main() -> None:
     recipe = demo_recipe(given.scene, given.seconds, meeting_seed(given.scene))
     folder = given.session or make_cached_session(recipe, progress=lambda stage, done, total: None)
     width, height = map(int, given.size.split("x"))
-    pngs = list[bytes]()
-    for one in pictures(read_session(folder.resolve()), given.seconds, given.hz, width, height):
-        pngs.append(one)
-        print(f"{len(pngs)} of {round(given.seconds * given.hz)} pictures", end="\r", file=sys.stderr)
-        if given.keep is not None:
-            given.keep.mkdir(parents=True, exist_ok=True)
-            (given.keep / f"{len(pngs):04}.png").write_bytes(one)
+    pngs = pictures(read_session(folder.resolve()), given.seconds, given.hz, width, height)
+    if given.keep is not None:
+        given.keep.mkdir(parents=True, exist_ok=True)
+        for k, one in enumerate(pngs, 1):
+            (given.keep / f"{k:04}.png").write_bytes(one)
     data = animation(pngs, round(1000 / given.hz / given.speed), given.width)
     given.out.write_bytes(data)
     print(f"{given.out}: {len(pngs)} pictures, {len(data) / 1e6:.2f} MB")
