@@ -1,4 +1,4 @@
-"""Record the live room while two headset wearers and a robot play, as an animated WebP such as the one in README.
+"""Record the live room while two wearers and a robot play, as an animated WebP such as the one in README.
 
     share emulate --scene warehouse --motion ar1=walk: --motion ar2=walk:speed=1.2 --motion robot=robot: \\
         --profile d435i:640x480@15 --seconds 30 --seed 901 --out room
