@@ -1,9 +1,13 @@
-"""Record the live room of a demo as an animated WebP, such as the one in README.
+"""Record the live room while two wearers and a robot play, as an animated WebP such as the one in README.
 
-    python tools/record_live_room.py --seconds 60 --out docs/pictures/live-room.webp
+    share emulate --scene warehouse --motion ar1=walk: --motion ar2=walk:speed=1.2 --motion robot=robot: \\
+        --profile d435i:640x480@15 --seconds 30 --seed 901 --out room
+    python tools/record_live_room.py --session room --seconds 30 --out docs/pictures/live-room.webp
 
-Runs `share demo`, opens its page in a headless Chromium (`chromium` on the path, or CHROMIUM) and takes a
-picture of it twice a second. It needs the extras `view` and `websocket` and Pillow.
+made that one; without --session it is the demo's. The session is played in virtual time
+(`share.lab.evaluate.simulation`), so that a slow browser changes nothing: between two pictures the room
+waits. A headless Chromium (`chromium` on the path, or CHROMIUM) draws the page. Needs the extras `emulate`
+and `view`, and Pillow.
 """
 
 from __future__ import annotations
@@ -13,23 +17,39 @@ import base64
 import io
 import json
 import os
-import re
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-from websockets.sync.client import connect
+from share import startup
+
+startup.prepare_process()
+
+from PIL import Image  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+from share.config import Config  # noqa: E402
+from share.lab.emulate.recipe import demo_recipe, meeting_seed  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
+from share.lab.evaluate.shown_simulation import shown_simulation  # noqa: E402
+from share.recordings.session import Session, read_session  # noqa: E402
+from share.view.viewer import LiveRoom  # noqa: E402
 
 MAX_BYTES = 1_900_000
-QUALITIES = (70, 60, 50, 40, 30, 20)  # the first whose file is small enough
+QUALITIES = (75, 65, 55, 45, 35, 25)  # the first whose file is small enough
+_WITHOUT_NOTES = (  # what viser says of a browser without a graphics card
+    "document.querySelectorAll('[class*=Notification-root]').forEach(note => note.remove())"
+)
+_POSES_SEEN_S, _SETTLE_S = 0.07, 0.35  # for the live room, which draws fifteen times a second; for the page
+
+
+# A browser
 
 
 class Page:
@@ -42,7 +62,7 @@ class Page:
         self._number += 1
         self._connection.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._connection.recv(timeout=60))
+            answer = json.loads(self._connection.recv(timeout=120))
             if answer.get("id") == self._number:
                 return dict(answer.get("result", {}))
 
@@ -63,7 +83,7 @@ class Page:
 def browser_page(url: str, width: int, height: int) -> Iterator[Page]:
     """Open a URL in a browser of its own."""
     program = os.environ.get("CHROMIUM", "chromium")
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         command = [
             *(program, "--headless=new", "--no-sandbox", "--hide-scrollbars"),
             *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--remote-debugging-port=0"),
@@ -76,73 +96,58 @@ def browser_page(url: str, width: int, height: int) -> Iterator[Page]:
                 target = next(one for one in json.load(listing) if one["type"] == "page")
             with connect(target["webSocketDebuggerUrl"], max_size=None) as connection:
                 page = Page(connection)
-                page.call(
-                    "Emulation.setDeviceMetricsOverride",
-                    **{"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600},
-                )
+                metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+                page.call("Emulation.setDeviceMetricsOverride", **metrics)
                 page.call("Page.navigate", url=url)
                 yield page
         finally:
             process.terminate()
-            process.wait(10)
+            process.wait(30)
 
 
 def _devtools_port(profile: Path) -> int:
     """Return the port that a browser with this profile listens on."""
-    for _ in range(200):
-        path = profile / "DevToolsActivePort"
+    path = profile / "DevToolsActivePort"
+    for _ in range(600):
         if path.is_file() and (text := path.read_text()):
             return int(text.split()[0])
         time.sleep(0.1)
     raise SystemExit("the browser did not start")
 
 
-@contextmanager
-def running_demo(seconds: float, more: list[str]) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run the demo; yield it, and the address of its live room."""
-    with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "share", "demo", "--seconds", str(seconds), "--out", out, *more]
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        try:
-            assert process.stderr is not None
-            lines = (re.search(r"live room at (http://\S+)", line) for line in process.stderr)
-            address = next((found[1] for found in lines if found), None)
-            if address is None:
-                raise SystemExit("the demo has not said where its live room is; is viser installed?")
-            yield process, address
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(60)
+# The room
 
 
-def record(seconds: float, hz: float, width: int, height: int, more: list[str]) -> list[bytes]:
-    """Return pictures (PNG) of a demo from its start to its end."""
-    pictures = []
-    with running_demo(seconds, more) as (demo, address), browser_page(address, width, height) as page:
-        start_s = time.monotonic()
-        while demo.poll() is None and time.monotonic() - start_s < seconds + 15:
-            due_s = start_s + len(pictures) / hz
-            time.sleep(max(0.0, due_s - time.monotonic()))
-            pictures.append(page.picture())
-    return pictures
+def pictures(session: Session, seconds: float, hz: float, width: int, height: int) -> list[bytes]:
+    """Return pictures (PNG) of a session from its start to its end."""
+    with closing(LiveRoom("0", None, "SHARE edge")) as live:
+        room = shown_simulation(session, Config(), live.feed)
+        with browser_page(f"http://{live.endpoint}/", width, height) as page:
+            time.sleep(8.0)
+            page.evaluate(_WITHOUT_NOTES)
+            taken = list[bytes]()
+
+            def take(t_s: float) -> None:
+                time.sleep(_POSES_SEEN_S)
+                if t_s >= (len(taken) + 1) / hz - 1e-6:
+                    time.sleep(_SETTLE_S)
+                    taken.append(page.picture())
+                    print(f"{len(taken)} of {round(seconds * hz)} pictures", end="\r", file=sys.stderr)
+
+            room.play(seconds, take)
+    return taken
 
 
-def animation(pictures: list[bytes], milliseconds: int) -> bytes:
-    """Return an animated WebP, of the best quality that is small enough."""
-    frames = [Image.open(io.BytesIO(one)).convert("RGB") for one in pictures]
+def animation(pngs: list[bytes], milliseconds: int, width: int) -> bytes:
+    """Return an animated WebP so many pixels wide, of the best quality that is small enough."""
+    frames = [Image.open(io.BytesIO(one)).convert("RGB") for one in pngs]
+    size = width, round(frames[0].height * width / frames[0].width)
+    frames = [one.resize(size, Image.Resampling.LANCZOS) for one in frames]
     data = b""
     for quality in QUALITIES:
         out = io.BytesIO()
-        frames[0].save(
-            out,
-            "WEBP",
-            save_all=True,
-            append_images=frames[1:],
-            duration=milliseconds,
-            loop=0,
-            quality=quality,
-            method=4,
-        )
+        rest = {"append_images": frames[1:], "duration": milliseconds, "loop": 0}
+        frames[0].save(out, "WEBP", save_all=True, quality=quality, method=4, **rest)
         data = out.getvalue()
         if len(data) <= MAX_BYTES:
             break
@@ -152,21 +157,26 @@ def animation(pictures: list[bytes], milliseconds: int) -> bytes:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--hz", type=float, default=2.0)
-    parser.add_argument("--speed", type=float, default=2.0, help="How much faster it is shown.")
-    parser.add_argument("--size", default="960x600")
+    parser.add_argument("--scene", default="warehouse")
+    parser.add_argument("--session", type=Path, help="in place of the demo's: a folder by `share emulate`")
+    parser.add_argument("--hz", type=float, default=2.0, help="pictures a second")
+    parser.add_argument("--speed", type=float, default=1.0, help="how much faster it is shown")
+    parser.add_argument("--size", default="1280x720", help="of the page")
+    parser.add_argument("--width", type=int, default=960, help="of the animation")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--keep", type=Path, help="Folder for the pictures themselves.")
-    given, more = parser.parse_known_args()
+    parser.add_argument("--keep", type=Path, help="folder for the pictures themselves")
+    given = parser.parse_args()
+    recipe = demo_recipe(given.scene, given.seconds, meeting_seed(given.scene))
+    folder = given.session or make_cached_session(recipe, progress=lambda stage, done, total: None)
     width, height = map(int, given.size.split("x"))
-    pictures = record(given.seconds, given.hz, width, height, more)
+    pngs = pictures(read_session(folder.resolve()), given.seconds, given.hz, width, height)
     if given.keep is not None:
         given.keep.mkdir(parents=True, exist_ok=True)
-        for k, one in enumerate(pictures):
+        for k, one in enumerate(pngs, 1):
             (given.keep / f"{k:04}.png").write_bytes(one)
-    data = animation(pictures, round(1000 / given.hz / given.speed))
+    data = animation(pngs, round(1000 / given.hz / given.speed), given.width)
     given.out.write_bytes(data)
-    print(f"{given.out}: {len(pictures)} pictures, {len(data) / 1e6:.2f} MB")
+    print(f"{given.out}: {len(pngs)} pictures, {len(data) / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

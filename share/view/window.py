@@ -340,7 +340,11 @@ def _small_picture(jpeg: bytes) -> Any:
 def _figure(title: str, jpeg: bytes) -> str:
     """Return a picture with its title as HTML."""
     data = base64.b64encode(jpeg).decode()
-    picture = f'<img style="width:100%" src="data:image/jpeg;base64,{data}">' if jpeg else "not kept any more"
+    picture = (
+        f'<img style="max-width:100%;max-height:34vh" src="data:image/jpeg;base64,{data}">'
+        if jpeg
+        else "not kept any more"
+    )
     return f'<figure style="margin:0 0 10px"><figcaption>{escape(title)}</figcaption>{picture}</figure>'
 
 

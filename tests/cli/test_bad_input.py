@@ -793,3 +793,10 @@ def test_invalid_frustum_is_refused_before_the_edge_starts(tmp_path: Path) -> No
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr == f"share: {config}: control: far_m: 0.1 m is not beyond the near plane, 0.3 m\n"
+
+
+@pytest.mark.parametrize("policy", ["covins-g", "streamed"])
+def test_compare_needs_another_policy_that_shares_a_map(share, policy):
+    done = share("demo", "--compare", "--policy", policy, "--out", "out")
+    assert done.code == 2
+    assert f"choose another than {policy}" in done.err

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from share.view import events as ev
 from share.view import loop_pictures
 from share.view.loop_pictures import KeyframePictures, nearest_to_ray
 from share.view.room import Room
+from share.view.viewer import Viewer
 
 
 def jpeg(shade: int, width: int = 640) -> bytes:
@@ -96,3 +100,32 @@ def test_the_nearest_by_angle_is_meant() -> None:
     assert nearest_to_ray(points, np.zeros(3), ray) == 1
     assert nearest_to_ray(points, np.zeros(3), np.array([1.0, 0.0, 0.0])) is None
     assert nearest_to_ray(np.zeros((0, 3)), np.zeros(3), ray) is None
+
+
+class Page:
+    """A window that was clicked once."""
+
+    def __init__(self, *clicks: Any) -> None:
+        self._clicks, self.shown = list(clicks), list[Any]()
+
+    def take_clicks(self) -> list[Any]:
+        return [self._clicks.pop() for _ in range(len(self._clicks))]
+
+    def show_views(self, browser: int, views: loop_pictures.LoopViews) -> None:
+        self.shown.append((browser, views.titles))
+
+    def draw(self, drawings: Any) -> None: ...
+
+    def follow(self, place: Any) -> None: ...
+
+    def show_panel(self, html: str, agents: Any) -> None: ...
+
+
+def test_a_click_is_answered_in_its_browser_alone(room: Room) -> None:
+    clicks = (SimpleNamespace(browser=7, origin=ABOVE, direction=DOWN),)
+    page = Page(*clicks, SimpleNamespace(browser=8, origin=ABOVE, direction=-DOWN))
+    viewer = Viewer(None, page)  # type: ignore[arg-type]
+    viewer._room = room
+    viewer._draw(0.0)
+    viewer._draw(1.0)
+    assert page.shown == [(7, ("ann, keyframe 0", "bob, keyframe 0"))]

@@ -1,11 +1,12 @@
 """What looking on costs: edge CPU and agents' pose latency without a live room, and with 0, 1 and 5 viewers.
 
-    python tools/experiments/measure_viewers.py SESSION [--rounds N] --out DIR
+    python tools/experiments/measure_viewers.py SESSION [--rounds N] [--out DIR] [--virtual SECONDS]
 
-Plays SESSION in real time once a round and setup, in another order each round, so that whatever else the
-machine does meets all setups alike. A viewer reads all that the live room sends. Prints a Markdown table of
-means, and of differences from the setup without a live room in the same round (mean, standard error);
-writes viewers.json.
+Plays SESSION in real time once a round and setup, in another order each round, so that what else the machine
+does meets all setups alike. A viewer reads all that the live room sends. Prints a Markdown table of means and
+of differences from the setup without a live room in the same round (mean, standard error); writes
+viewers.json. With --virtual it measures the CPU time of the edge's calls to the live room, and of the thread
+that sends to it, while the session is simulated: that does not depend on what else the machine does.
 """
 
 from __future__ import annotations
@@ -18,15 +19,27 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from tool_main import exit_code, line
+from share import startup
 
-from share.files.writing import atomic_write, writable_dir
-from share.lab.evaluate.real_time import share_command
+startup.prepare_process()
+
+import numpy as np  # noqa: E402
+from tool_main import exit_code, line  # noqa: E402
+
+from share.config import Config  # noqa: E402
+from share.files.writing import atomic_write, writable_dir  # noqa: E402
+from share.lab.evaluate.real_time import share_command  # noqa: E402
+from share.lab.evaluate.shown_simulation import shown_simulation  # noqa: E402
+from share.recordings.session import Session, read_session  # noqa: E402
+from share.runtime.edge_observer import EdgeObserver  # noqa: E402
+from share.view.feed import ViewFeed  # noqa: E402
+from share.view.viewer import LiveRoom  # noqa: E402
 
 SETUPS: tuple[int | None, ...] = (None, 0, 1, 5)  # viewers; None: no live room
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -186,12 +199,95 @@ def _difference(values: list[float], digits: int) -> str:
     return f"{np.mean(values):+.{digits}f} ± {error:.{digits}f}"
 
 
+# In virtual time: the edge's own CPU, which does not depend on what else the machine does
+
+
+class TimedObserver(EdgeObserver):
+    """Passes on what an edge shows, and counts the CPU time of the calls."""
+
+    def __init__(self, feed: ViewFeed) -> None:
+        self._feed, self.cpu_s = feed, 0.0
+
+    def begin_session(self, map_file: Path | None, known: Any) -> None:
+        self._timed(self._feed.begin_session, map_file, known)
+
+    def add_effect(self, effect: Any) -> None:
+        self._timed(self._feed.add_effect, effect)
+
+    def add_result(self, result: Any) -> None:
+        self._timed(self._feed.add_result, result)
+
+    def add_poses(self, poses: Any) -> None:
+        self._timed(self._feed.add_poses, poses)
+
+    def add_report(self, report: Any) -> None:
+        self._timed(self._feed.add_report, report)
+
+    def _timed(self, call: Callable[..., None], *arguments: Any) -> None:
+        start_s = time.thread_time()
+        call(*arguments)
+        self.cpu_s += time.thread_time() - start_s
+
+
+def play_virtually(session: Session, seconds: float, viewers: int) -> dict[str, float]:
+    """Play a session at the pace of its clock; return CPU seconds: of edge, mapper and agents together, of
+    the edge's calls to the live room, of the thread that sends to it, and of its process."""
+    counts = list[int]()
+    with closing(LiveRoom("0", None, "measured")) as live:
+        observer = TimedObserver(live.feed)
+        room = shown_simulation(session, Config(), observer)
+        for _ in range(viewers):
+            address = f"http://{live.endpoint}/"
+            threading.Thread(target=_look_on, args=(address, counts), daemon=True).start()
+        start_s, cpu_s = time.monotonic(), time.thread_time()
+
+        def keep_pace(t_s: float) -> None:
+            time.sleep(max(0.0, start_s + t_s - time.monotonic()))
+
+        sender = next(one for one in threading.enumerate() if one.name == "view")
+        room.play(seconds, keep_pace)
+        cpu_s = time.thread_time() - cpu_s
+        return {
+            "all": cpu_s,
+            "calls": observer.cpu_s,
+            "sender": _thread_cpu_s(os.getpid(), sender.native_id or 0),
+            "process": _stats()[live.pid or 0][1],
+            "messages": len(counts),
+        }
+
+
+def _thread_cpu_s(pid: int, thread: int) -> float:
+    fields = Path(f"/proc/{pid}/task/{thread}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS
+
+
+def virtual_table(session: Session, seconds: float, rounds: int) -> str:
+    rows = [line(("viewers", "all, s", "calls, ms", "sender, ms", "of all, %", "live room, s", "messages"))]
+    rows.append(line(["---"] * 7))
+    for viewers in SETUPS[1:]:
+        played = [play_virtually(session, seconds, viewers or 0) for _ in range(rounds)]
+        mean = {name: float(np.mean([one[name] for one in played])) for name in played[0]}
+        share = 100 * (mean["calls"] + mean["sender"]) / mean["all"]
+        cells = [
+            f"{mean['all']:.2f}",
+            f"{1e3 * mean['calls']:.1f}",
+            f"{1e3 * mean['sender']:.0f}",
+            f"{share:.2f}",
+        ]
+        rows.append(line((str(viewers), *cells, f"{mean['process']:.2f}", f"{mean['messages']:.0f}")))
+    return "\n".join(rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("session", type=Path)
     parser.add_argument("--rounds", type=int, default=4)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=Path("viewers"))
+    parser.add_argument("--virtual", type=float, metavar="SECONDS", help="measure the edge's calls alone")
     given = parser.parse_args()
+    if given.virtual is not None:
+        print(virtual_table(read_session(given.session.resolve()), given.virtual, given.rounds))
+        return
     writable_dir(given.out)
     runs = list[Played]()
     for number in range(given.rounds):

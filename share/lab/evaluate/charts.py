@@ -31,7 +31,7 @@ def save_png(figure: Any, path: Path, dpi: int) -> None:
 
 
 _NO_INTERVAL = Interval(float("nan"), float("nan"), float("nan"))
-_MAX_COLUMNS = 3  # panels
+_WIDTH_IN, _MAX_COLUMNS = 6.5, 2  # of a figure, which a phone shows too; of its panels
 
 
 def draw_bars(
@@ -71,8 +71,9 @@ def draw_ratios(path: Path, series: Mapping[str, Mapping[str, Interval]], base: 
     """Write a PNG with a bar per measure for each of `series`, as ratios to `base`; whiskers are intervals,
     where they are known."""
     pyplot = agg_pyplot()
-    measures = list(dict.fromkeys(name for values in series.values() for name in values))
-    figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
+    known = {name for of in series.values() for name, one in of.items() if np.isfinite(one.value)}
+    measures = [name for name in next(iter(series.values())) if name in known]
+    figure, axis = pyplot.subplots(figsize=(_WIDTH_IN, 0.5 + 0.5 * len(measures)), layout="constrained")
     positions, bar_width = np.arange(len(measures)), 0.8 / len(series)
     colours = series_colours(series)
     for k, (name, values) in enumerate(series.items()):
@@ -99,7 +100,12 @@ def draw_lines(
     """Write a PNG with a panel for each of `panels`, in one of `units` each: {series: (x (N,), y (N,))}."""
     pyplot = agg_pyplot()
     figure, axes = pyplot.subplots(
-        len(panels), 1, figsize=(9, 2.4 * len(panels)), layout="constrained", sharex=True, squeeze=False
+        len(panels),
+        1,
+        figsize=(_WIDTH_IN, 2.2 * len(panels)),
+        layout="constrained",
+        sharex=True,
+        squeeze=False,
     )
     colours = series_colours(name for series in panels.values() for name in series)
     for axis, unit, (title, series) in zip(axes[:, 0], units, panels.items(), strict=True):

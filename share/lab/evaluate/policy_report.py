@@ -77,7 +77,7 @@ def _headline(compared: _Comparisons, base: str) -> str:
     for mine in compared[subject]:
         if mine.measure.name not in _HEADLINE or math.isnan(mine.ratio.value):
             continue
-        unit = f" {mine.measure.unit}" if mine.measure.unit else ""
+        unit = f" {mine.measure.unit}" if mine.measure.unit in ("ms", "cm") else ""
         told.append(
             f"{mine.measure.name} {format_number(mine.value.value)}{unit}, "
             f"{format_number(mine.ratio.value, '.2f')} of `{base}`'s"

@@ -213,6 +213,7 @@ class Simulation:
 
     def _to_edge(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, self.now_ns):
+            self._edge_did(effect)
             match effect:
                 case ed.SendToPeer():
                     self._send_down(effect)
@@ -223,6 +224,9 @@ class Simulation:
                     self._to_edge(ed.ChangesSaved(effect.ticket))
                 case ed.WriteEvent():
                     self._on_record(effect.fields)
+
+    def _edge_did(self, effect: ed.EdgeEffect) -> None:
+        """An effect of the edge, for those who look on."""
 
     def _send_down(self, effect: ed.SendToPeer) -> None:
         member, frames = self._members[effect.peer_id], effect.frames

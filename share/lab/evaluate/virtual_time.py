@@ -24,7 +24,7 @@ from share.files.line_file import LineFile
 from share.files.writing import atomic_write, writable_dir
 from share.files.yaml_file import read_settings
 from share.geometry.camera import Rig
-from share.lab.evaluate.emulated_network import LinkAssignment
+from share.lab.evaluate.emulated_network import LinkAssignment, NetworkModel
 from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
 from share.lab.evaluate.real_time import MapMembership, Progress, RunOptions
 from share.lab.evaluate.simulation import Simulation, TrackedFrame
@@ -71,15 +71,7 @@ def play_in_virtual_time(
     tracked = track_session(session.folder.resolve(), *tracker_settings, error_source)
     links = LinkAssignment.parse(options.link)
     links.check(session.agents, virtual=True)
-    start_ns = min(frames[0].arrival_ns for _, frames in tracked.values() if frames)
-    members = [
-        (
-            Hello(name, agent.kind, number + 1, tracked[name][0]),
-            _relative_frames(tracked[name][1], start_ns),
-            links.network_for(name),
-        )
-        for number, (name, agent) in enumerate(session.agents.items())
-    ]
+    members = session_members(session, tracked, links)
     folders = {name: out / name for name in session.agents}
     observer = _RunWriter(folders, writable_dir(out / "edge"), show)
     costs = ProcessingDelays() if options.costs is None else read_delays(Path(options.costs))
@@ -94,6 +86,21 @@ def play_in_virtual_time(
     world.run(seconds + _DRAIN_S)
     observer.finish(world, settings)
     return folders
+
+
+def session_members(
+    session: Session, tracked: Mapping[str, tuple[Rig, list[TrackedFrame]]], links: LinkAssignment
+) -> list[tuple[Hello, Iterator[TrackedFrame], NetworkModel]]:
+    """Return the agents of a simulation. tracked: as from `track_session`."""
+    start_ns = min(frames[0].arrival_ns for _, frames in tracked.values() if frames)
+    return [
+        (
+            Hello(name, agent.kind, number + 1, tracked[name][0]),
+            _relative_frames(tracked[name][1], start_ns),
+            links.network_for(name),
+        )
+        for number, (name, agent) in enumerate(session.agents.items())
+    ]
 
 
 @lru_cache(maxsize=1)  # policies follow each other on one session
