@@ -77,6 +77,8 @@ class KeyframeLookup:
         reason = f"keyframe {key.id}: its image is damaged: without it"
         damaged = [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", reason)]
         yield [*damaged, *self._review_joins(node_id)]
+        if node_id in self._views.by_node:
+            self._atlas.renewal.review(node_id)
 
     def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
         """Align the images of keyframes near this one by the map's poses. Return whether one did."""
