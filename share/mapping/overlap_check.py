@@ -83,7 +83,6 @@ class JoinProbation:
     counted_at: F64 | None = None
 
     def add(self, comparison: Comparison) -> None:
-        self.view_count += 1
         self.missing = cusum(self.missing, comparison)
         self.lost = max(0.0, self.lost + comparison.lack)
 
@@ -148,10 +147,12 @@ class OverlapCheck:
             if segment in pair and self._is_one_map(pair):
                 comparison = self._compare_nearest(node_id, pair[0] if segment == pair[1] else pair[1])
                 pose = self._graph.poses[node_id]
-                if comparison is None or _counts_already(probation, comparison, pose):
+                if comparison is None:
                     continue
-                probation.add(comparison)
-                probation.counted_at = pose
+                probation.view_count += 1
+                if not _counts_already(probation, comparison, pose):
+                    probation.add(comparison)
+                    probation.counted_at = pose
                 yield pair, probation
                 is_clear = not probation.missing and not probation.lost
                 if probation.view_count >= _PROBATION_VIEWS and is_clear:
