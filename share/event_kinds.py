@@ -24,6 +24,7 @@ EventKind = Literal[
     "maps merged",
     "merge skipped",
     "merge undone",
+    "map renewed",
     "correction",
     "correction held back",
     "agent quarantined",

@@ -95,7 +95,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "merge.surprise_chi2": "mapping.loop_acceptance._CONTRADICT_CHI2",
     "merge.max_pending": "mapping.loop_acceptance._MAX_PENDING",
     "merge.join_found": "mapping.loop_acceptance.JOIN_FOUND",
-    "merge.overlap_gone": "mapping.loop_acceptance._OVERLAP_MISSING",
+    "merge.overlap_gone": "mapping.overlap_check.SAME_DAY",
     "merge.undo_doubt": "mapping.loop_acceptance._UNDO_CUSUM",
     "merge.rival_weight": "mapping.loop_acceptance._COMPETING_WEIGHT",
     "merge.rebel_places": "mapping.loop_acceptance._CONTRADICTING_PLACES",

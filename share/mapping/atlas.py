@@ -25,6 +25,7 @@ from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import SaveLink, SavePoses, StoredMap
 from share.mapping.map_graph import MapGraph
+from share.mapping.map_renewal import MapRenewal
 from share.mapping.map_solving import MapSolving
 from share.mapping.overlap_check import OverlapCheck
 from share.mapping.recognition.verification import CameraView
@@ -37,13 +38,16 @@ class Atlas:
 
     graph: poses, edges and maps. quarantine: agents that are kept apart. loop_acceptance: loops between two
     maps and within one. solving: jobs of the solver and their solutions. culling: keyframes to remove.
+    renewal: keyframes of earlier sessions that show what is gone.
     """
 
     def __init__(self, config: MergeConfig, camera_views: Mapping[int, CameraView] | None = None) -> None:
         """camera_views: by node id; the caller keeps them up to date."""
         known_views: Mapping[int, CameraView] = {} if camera_views is None else camera_views
         self.graph = MapGraph()
-        self.loop_acceptance = LoopAcceptance(config, self.graph, OverlapCheck(self.graph, known_views))
+        self._overlap_check = OverlapCheck(self.graph, known_views)
+        self.loop_acceptance = LoopAcceptance(config, self.graph, self._overlap_check)
+        self.renewal = MapRenewal(self.graph, known_views, self._overlap_check)
         self._localisation_gate = LocalisationGate(config.enter_m)
         self._runs = AgentRuns()
         self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self._runs)
@@ -178,6 +182,7 @@ class Atlas:
             node_ids.append(node_id)
         for loop in kept.loops:
             graph.add_loop(loop)
+        self._overlap_check.note_restored(max(node_ids, default=-1) + 1)
         self.quarantine.suspect_restored()
         for agent in set(agents):
             current = graph.odometry.current_segment(agent)

@@ -192,10 +192,13 @@ class KeyframeLookup:
         return [*events, *undone, accepted]
 
     def _review_joins(self, node_id: int) -> list[MapEvent]:
-        """Undo a recent merge that the view of a new keyframe contradicts."""
-        known = node_id in self._views.by_node
-        decision = self._atlas.loop_acceptance.review_joins(node_id) if known else None
+        """Undo a recent merge that the view of a new keyframe contradicts; else see what is gone since an
+        earlier session."""
+        if node_id not in self._views.by_node:
+            return []
+        decision = self._atlas.loop_acceptance.review_joins(node_id)
         if decision is None:
+            self._atlas.renewal.review(node_id)
             return []
         self._log.record_loops(decision)
         return [MapEvent(self._atlas.key(node_id).agent, "merge undone", decision.reason)]

@@ -42,8 +42,7 @@ AGREE_CHI2 = 22.5  # two loops agree, or a loop fits the map (99.9 %, 6 dof)
 _CONTRADICT_CHI2 = 200.0  # above this a loop contradicts the map whatever supporting loops there are
 _MAX_PENDING = 200  # pending loops; the oldest is dropped
 JOIN_FOUND = 0.3  # share of the common points that must be found, on average, before maps merge
-_OVERLAP_MISSING = 0.06  # largest share of the common points that may be missing
-_UNDO_CUSUM = 0.6  # CUSUM of the missing share above that; more forbids or undoes a merge
+_UNDO_CUSUM = 0.6  # CUSUM of the missing share above the usual; more forbids or undoes a merge
 _UNDO_LOST = 1.5  # CUSUM of what is found too seldom; more undoes a merge (true pairs: below 1.0)
 _COMPETING_WEIGHT = 0.5  # a competing hypothesis with more than this share of the weight blocks a merge
 _CONTRADICTING_PLACES = 4  # contradicting loops split a map from this many places on
@@ -104,7 +103,7 @@ class LoopAcceptance:
 
     def review_joins(self, node_id: int) -> LoopDecision | None:
         """Undo a recent merge that the view of a new node contradicts; None if there is none."""
-        for (a, b), probation in self._overlap_check.review_joins(node_id, _OVERLAP_MISSING):
+        for (a, b), probation in self._overlap_check.review_joins(node_id):
             if probation.missing > _UNDO_CUSUM or probation.lost > _UNDO_LOST:
                 self._overlap_check.end_probation((a, b))
                 dropped = self._graph.drop_loops(self._separating_loops(a, b))
@@ -258,14 +257,14 @@ class LoopAcceptance:
         comparisons = self._overlap_check.compare_overlap(loop)
         if len(comparisons) < self._config.overlap_pairs:
             return f", but only {len(comparisons)} views overlap: pending"
-        missing_share = sum(comparison.missing_share for comparison in comparisons) / max(1, len(comparisons))
-        if missing_share > _OVERLAP_MISSING:
+        if not comparisons:
+            return ""
+        missing_share = float(np.mean([comparison.regions.missing_share for comparison in comparisons]))
+        if sum(comparison.excess_missing for comparison in comparisons) > 0:
             return (
                 f", but {missing_share:.0%} of the {len(comparisons)} overlapping views is missing: pending"
             )
-        cusums = itertools.accumulate(
-            comparisons, lambda value, comparison: cusum(value, comparison, _OVERLAP_MISSING), initial=0.0
-        )
+        cusums = itertools.accumulate(comparisons, cusum, initial=0.0)
         if (worst := max(cusums)) > _UNDO_CUSUM:
             return f", but things are missing in consecutive views (CUSUM {worst:.1f}): pending"
         return ""

@@ -34,7 +34,7 @@ class Loop:
     """A verified relative pose of two keyframes: T_a_b (4, 4) of their bodies, cov (6, 6), inlier count.
 
     found_share: share of the points visible in both views that both views show
-    (`share.mapping.overlap_check`); None if not computed.
+    (`share.mapping.missing_points`); None if not computed.
     """
 
     a: KeyframeKey

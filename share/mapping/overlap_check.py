@@ -14,30 +14,57 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from share.geometry import se3
+from share.mapping.loop_consistency import is_at_any
 from share.mapping.loops import Loop
 from share.mapping.map_graph import MapGraph
-from share.mapping.recognition.refinement import transfer_keypoints
+from share.mapping.missing_points import MissingRegions, missing_points, missing_regions
 from share.mapping.recognition.verification import CameraView
-from share.types import F64, I64
-from share.vision.matching import hamming_rowwise
+from share.types import F64
 
 # Views within both are from one spot and should look alike.
 _NEAR_M = 1.0
 _NEAR_RAD = 0.5
-_MIN_POINTS = 20  # visible in a pair of views; below, the pair is not informative
 _MAX_PAIRS = 40  # compared before a merge
 _MAX_COMPARED = 500  # nodes of a map for which the nearest nodes of the other are searched for
 _NEIGHBOURS = 16  # nearest of those
 _PROBATION_VIEWS = 40  # compared after a merge; probation ends then if both sums are zero
-_FOUND_SHARE = 0.55  # of the points in both views: found in true pairs 0.62 to 0.75, in copies 0.55 to 0.60
 # A pair that moved by less is not compared again.
 _SAME_M = 0.02
 _SAME_RAD = 0.01
 _MAX_CACHED = 4000  # pairs
+
+
+class UsualShares(NamedTuple):
+    """Of the points in both views of a right pair: missing, the share in missing regions, is seldom more;
+    found, the share that is found, seldom less."""
+
+    missing: float
+    found: float
+
+
+# True pairs: found 0.62 to 0.75; copies: 0.55 to 0.60.
+SAME_DAY = UsualShares(missing=0.06, found=0.55)
+# A view of an earlier session: other light, and things have gone. True pairs miss 0.00 to 0.07 in the mean.
+OTHER_DAY = UsualShares(missing=0.10, found=0.50)
+
+
+class Comparison(NamedTuple):
+    """A pair of views, and what is usual for a right one."""
+
+    regions: MissingRegions
+    usual: UsualShares
+
+    @property
+    def excess_missing(self) -> float:
+        return self.regions.missing_share - self.usual.missing
+
+    @property
+    def lack(self) -> float:
+        """Return by how much too little is found."""
+        return self.usual.found - self.regions.found_share
 
 
 @dataclass(eq=False)
@@ -45,19 +72,19 @@ class JoinProbation:
     """Probation of a merge between two segments: sums over its views, floored at 0 (Page's CUSUM, Biometrika
     1954).
 
-    missing: of the share of points in missing regions above the allowed one; lost: of the share that is
-    found below `_FOUND_SHARE`. Copies differ by single things, which are missing, and by much that is found
-    less often.
+    missing: of the share of points in missing regions above what is usual; lost: of the share that is found
+    below what is usual. Copies differ by single things, which are missing, and by much that is found less
+    often. counted_at: pose of the last view that counted.
     """
 
     missing: float = 0.0
     lost: float = 0.0
     view_count: int = 0
+    counted_at: F64 | None = None
 
-    def add(self, comparison: MissingRegions, allowed_share: float) -> None:
-        self.view_count += 1
-        self.missing = cusum(self.missing, comparison, allowed_share)
-        self.lost = max(0.0, self.lost + _FOUND_SHARE - comparison.found_share)
+    def add(self, comparison: Comparison) -> None:
+        self.missing = cusum(self.missing, comparison)
+        self.lost = max(0.0, self.lost + comparison.lack)
 
 
 class OverlapCheck:
@@ -71,6 +98,19 @@ class OverlapCheck:
         self._graph, self._camera_views = graph, camera_views
         self._cache: dict[tuple[int, int], tuple[F64, MissingRegions]] = {}
         self._probations: dict[tuple[int, int], JoinProbation] = {}
+        self._restored_count = 0
+
+    def note_restored(self, count: int) -> None:
+        """Set that nodes with smaller ids than this are of an earlier session."""
+        self._restored_count = count
+
+    def is_earlier(self, node_id: int) -> bool:
+        """Return whether a node is of an earlier session."""
+        return node_id < self._restored_count
+
+    def is_on_probation(self, segment: int) -> bool:
+        """Return whether a merge of this segment is on probation."""
+        return any(segment in pair and self._is_one_map(pair) for pair in self._probations)
 
     def with_found_share(self, loop: Loop) -> Loop:
         """Return the loop with its found share, if both views are known."""
@@ -79,7 +119,7 @@ class OverlapCheck:
             return loop
         return replace(loop, found_share=1 - missing_points(b, a, loop.T_a_b).missing_share)
 
-    def compare_overlap(self, loop: Loop) -> list[MissingRegions]:
+    def compare_overlap(self, loop: Loop) -> list[Comparison]:
         """Compare the overlap of two maps (within one map: of two segments), placed as the loop says.
 
         Pairs views from about the same spot, each view once; in the order of b's nodes.
@@ -93,26 +133,30 @@ class OverlapCheck:
         poses_a, poses_b = (graph.poses.stack(nodes) for nodes in (nodes_a, nodes_b))
         pairs = _near_pairs(poses_a, T_b @ poses_b)
         comparisons = ((j, self._compare_views(nodes_a[i], nodes_b[j], T)) for i, j, T in pairs)
-        return [comparison for _, comparison in sorted(_informative(comparisons, _MAX_PAIRS))]
+        return [
+            comparison for _, comparison in sorted(_informative(comparisons, _MAX_PAIRS), key=lambda x: x[0])
+        ]
 
     def begin_probation(self, loop: Loop) -> None:
         """Put the merge that this loop made on probation."""
         self._probations[self._segment_pair(loop)] = JoinProbation()
 
-    def review_joins(
-        self, node_id: int, allowed_share: float
-    ) -> Iterator[tuple[tuple[int, int], JoinProbation]]:
+    def review_joins(self, node_id: int) -> Iterator[tuple[tuple[int, int], JoinProbation]]:
         """Compare a new node with each segment whose merge with the node's segment is on probation.
 
-        allowed_share: share of a view that may be missing. Yields both segments and their probation.
+        Yields both segments and their probation.
         """
         segment = self._graph.odometry.nodes[node_id].segment
         for pair, probation in list(self._probations.items()):
             if segment in pair and self._is_one_map(pair):
                 comparison = self._compare_nearest(node_id, pair[0] if segment == pair[1] else pair[1])
+                pose = self._graph.poses[node_id]
                 if comparison is None:
                     continue
-                probation.add(comparison, allowed_share)
+                probation.view_count += 1
+                if not _counts_already(probation, comparison, pose):
+                    probation.add(comparison)
+                    probation.counted_at = pose
                 yield pair, probation
                 is_clear = not probation.missing and not probation.lost
                 if probation.view_count >= _PROBATION_VIEWS and is_clear:
@@ -135,7 +179,7 @@ class OverlapCheck:
     def _is_one_map(self, pair: tuple[int, int]) -> bool:
         return self._graph.reference_segments[pair[0]] == self._graph.reference_segments[pair[1]]
 
-    def _compare_nearest(self, node_id: int, segment: int) -> MissingRegions | None:
+    def _compare_nearest(self, node_id: int, segment: int) -> Comparison | None:
         """Compare the node with the nearest view of the segment that is near enough and informative."""
         nodes = self._with_views(self._graph.odometry.segments[segment].nodes)
         if not nodes or node_id not in self._camera_views:
@@ -148,34 +192,40 @@ class OverlapCheck:
     def _with_views(self, nodes: Sequence[int]) -> list[int]:
         return [n for n in nodes if n in self._camera_views]
 
-    def _compare_views(self, a: int, b: int, T_a_b: F64) -> MissingRegions:
+    def _compare_views(self, a: int, b: int, T_a_b: F64) -> Comparison:
+        is_same_day = self.is_earlier(a) == self.is_earlier(b)
+        return Comparison(self._missing_regions(a, b, T_a_b), SAME_DAY if is_same_day else OTHER_DAY)
+
+    def _missing_regions(self, a: int, b: int, T_a_b: F64) -> MissingRegions:
         """Cached: the same pairs are compared again for every further loop of a hypothesis."""
         if (cached := self._cache.get((a, b))) is not None:
             offset = se3.inverse(cached[0]) @ T_a_b
             if np.linalg.norm(offset[:3, 3]) < _SAME_M and se3.rotation_angle(offset) < _SAME_RAD:
                 return cached[1]
         self.comparison_count += 1
-        comparison = missing_regions(self._camera_views[b], self._camera_views[a], T_a_b)
+        regions = missing_regions(self._camera_views[b], self._camera_views[a], T_a_b)
         if len(self._cache) >= _MAX_CACHED:
             self._cache.clear()
-        self._cache[a, b] = T_a_b, comparison
-        return comparison
+        self._cache[a, b] = T_a_b, regions
+        return regions
 
 
-def cusum(previous: float, comparison: MissingRegions, allowed_share: float) -> float:
-    """Sum, floored at 0, of the missing share beyond `allowed_share` (Page's CUSUM, Biometrika 1954)."""
-    return max(0.0, previous + comparison.missing_share - allowed_share)
+def _counts_already(probation: JoinProbation, comparison: Comparison, pose: F64) -> bool:
+    """Return whether a view shows what the last one showed: what has gone since another day is one thing,
+    however many views miss it."""
+    last = [] if probation.counted_at is None else [probation.counted_at]
+    return comparison.usual is OTHER_DAY and is_at_any(pose, last)
 
 
-def _informative(
-    comparisons: Iterator[tuple[int, MissingRegions]], limit: int
-) -> list[tuple[int, MissingRegions]]:
+def cusum(previous: float, comparison: Comparison) -> float:
+    """Sum, floored at 0, of the missing share beyond what is usual (Page's CUSUM, Biometrika 1954)."""
+    return max(0.0, previous + comparison.excess_missing)
+
+
+def _informative(comparisons: Iterator[tuple[int, Comparison]], limit: int) -> list[tuple[int, Comparison]]:
     """The first `limit` comparisons with enough visible points."""
-    return list(
-        itertools.islice(
-            (comparison for comparison in comparisons if comparison[1].visible >= _MIN_POINTS), limit
-        )
-    )
+    enough = (pair for pair in comparisons if pair[1].regions.is_informative)
+    return list(itertools.islice(enough, limit))
 
 
 def _near_pairs(poses_a: F64, poses_b: F64) -> Iterator[tuple[int, int, F64]]:
@@ -200,135 +250,3 @@ def _near_pairs(poses_a: F64, poses_b: F64) -> Iterator[tuple[int, int, F64]]:
             used_a.add(i)
             used_b.add(j)
             yield i, j, se3.inverse(poses_a[i]) @ poses_b[j]
-
-
-# Missing points of two views, if the two stand as verification says. Two places that look alike share most
-# points, but what only one of them has is missing in the other. Single points are missing anywhere (missed
-# detections, occlusion); where all points of a patch of the image are missing, a *thing* is missing: a
-# poster, a door, a box. Distributions: docs/understand/place-recognition.md.
-
-_FOUND_PX = 6.0  # radius within which a point is found
-_REGION_FOUND_PX = 15.0  # the same for patches: the map may have drifted
-_MAX_BITS = 90  # descriptor distance of a found point
-_OCCLUDER_PX = 40.0  # radius of the keypoints that may occlude a point
-_BORDER_SHARE = 0.03  # of each side of the image, where the detector finds nothing
-# A point is occluded if all keypoints around it have inverse depths above ratio * rho + offset.
-_OCCLUSION_RATIO = 1.2
-_OCCLUSION_RHO = 0.02  # 1/m
-_REGION_RAD = 0.1  # radius of a patch
-_MIN_REGION_POINTS = 10  # visible points in a patch: if none is found, the patch is missing
-
-
-class MissingPoints(NamedTuple):
-    """Points of both views that should be visible in the other, and how many are found."""
-
-    visible: int
-    found: int
-
-    @property
-    def missing_share(self) -> float:
-        """Share of the visible points that are not found; 0 if none is visible."""
-        return 1 - self.found / self.visible if self.visible else 0.0
-
-
-class MissingRegions(NamedTuple):
-    """Points of both views that should be visible in the other, those in patches without any found, and those
-    found."""
-
-    visible: int
-    missing: int
-    found: int
-
-    @property
-    def missing_share(self) -> float:
-        """Share of the visible points in missing patches; 0 if none is visible."""
-        return self.missing / self.visible if self.visible else 0.0
-
-    @property
-    def found_share(self) -> float:
-        """Share of the visible points that are found, a little off too; 1 if none is visible."""
-        return self.found / self.visible if self.visible else 1.0
-
-
-def missing_points(query: CameraView, candidate: CameraView, T_c_q: F64) -> MissingPoints:
-    """Count visible and found points, given T_c_q (4, 4): the query's body in the candidate's body frame."""
-    in_candidate, in_query = _expected_both_ways(query, candidate, T_c_q, _FOUND_PX)
-    return MissingPoints(
-        len(in_candidate.is_found) + len(in_query.is_found),
-        int(in_candidate.is_found.sum() + in_query.is_found.sum()),
-    )
-
-
-def missing_regions(query: CameraView, candidate: CameraView, T_c_q: F64) -> MissingRegions:
-    """Count visible points and those in missing patches.
-
-    For views from about one spot: within 1 m little else is missing in a true pair. Farther apart, things
-    occlude each other without a keypoint to show it.
-    """
-    in_candidate, in_query = _expected_both_ways(query, candidate, T_c_q, _REGION_FOUND_PX)
-    return MissingRegions(
-        len(in_candidate.is_found) + len(in_query.is_found),
-        _count_in_missing_regions(in_candidate) + _count_in_missing_regions(in_query),
-        int(in_candidate.is_found.sum() + in_query.is_found.sum()),
-    )
-
-
-class _ExpectedPoints(NamedTuple):
-    """Points of one view that should be visible in the other: position there (N, 2), is_found (N,)."""
-
-    uv: F64
-    is_found: NDArray[np.bool_]
-
-
-def _expected_both_ways(
-    query: CameraView, candidate: CameraView, T_c_q: F64, reach_px: float
-) -> tuple[_ExpectedPoints, _ExpectedPoints]:
-    T = se3.inverse(candidate.T_body_cam0) @ T_c_q @ query.T_body_cam0
-    return _expected_points(T, query, candidate, reach_px), _expected_points(
-        se3.inverse(T), candidate, query, reach_px
-    )
-
-
-def _expected_points(T: F64, source: CameraView, target: CameraView, reach_px: float) -> _ExpectedPoints:
-    target_keypoints = target.keypoints
-    if not len(source.view) or not len(target_keypoints):
-        return _ExpectedPoints(np.zeros((0, 2)), np.zeros(0, bool))
-    moved = transfer_keypoints(T, source.keypoints.T).T
-    inside = np.flatnonzero(_is_inside(moved, target_keypoints))
-    moved = moved[inside]
-    rows, cols, px = _near_keypoints(target.focal * moved[:, :2], target.focal * target_keypoints[:, :2])
-    near_rows, near_cols = rows[px < reach_px], cols[px < reach_px]
-    bits = hamming_rowwise(source.view.descriptors[inside[near_rows]], target.view.descriptors[near_cols])
-    is_found = np.zeros(len(inside), bool)
-    is_found[near_rows[bits <= _MAX_BITS]] = True
-    nearby_rho = np.full(len(inside), np.inf)  # least inverse depth of keypoints around
-    np.fmin.at(nearby_rho, rows, target_keypoints[cols, 2])
-    is_visible = nearby_rho <= _OCCLUSION_RATIO * moved[:, 2] + _OCCLUSION_RHO
-    return _ExpectedPoints(moved[is_visible, :2], is_found[is_visible])
-
-
-def _count_in_missing_regions(expected: _ExpectedPoints) -> int:
-    """Count points in patches without a found point."""
-    missing_uv = expected.uv[~expected.is_found]
-    is_isolated = ~_are_within(missing_uv, expected.uv[expected.is_found], _REGION_RAD).any(1)
-    is_in_region = _are_within(missing_uv[is_isolated], missing_uv, _REGION_RAD).sum(1) >= _MIN_REGION_POINTS
-    return int(is_in_region.sum())
-
-
-def _are_within(a: F64, b: F64, radius: float) -> NDArray[np.bool_]:
-    """Mask (N, K) of points a (N, 2) and b (K, 2) nearer than `radius`."""
-    square = (a[:, :1] - b[:, 0]) ** 2 + (a[:, 1:] - b[:, 1]) ** 2
-    return np.asarray(square < radius**2)
-
-
-def _is_inside(moved: F64, target: F64) -> NDArray[np.bool_]:
-    """Mask of points in the part of the image where the target has keypoints; False for NaN."""
-    low, high = target[:, :2].min(0), target[:, :2].max(0)
-    margin = _BORDER_SHARE * (high - low)
-    return np.asarray(((moved[:, :2] > low + margin) & (moved[:, :2] < high - margin)).all(1))
-
-
-def _near_keypoints(a: F64, b: F64) -> tuple[I64, I64, F64]:
-    """Pairs of points a (N, 2) and b (K, 2), pixels, that are near: rows, columns, distances (M,)."""
-    distances = KDTree(a).sparse_distance_matrix(KDTree(b), _OCCLUDER_PX, output_type="ndarray")
-    return distances["i"], distances["j"], distances["v"]

@@ -6,9 +6,10 @@ from helpers.place_sim import bodies, sights
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.mapping.overlap_check import (
+from share.mapping.missing_points import (
     MissingPoints,
     MissingRegions,
+    gone_regions,
     missing_points,
     missing_regions,
 )
@@ -74,3 +75,15 @@ def test_an_empty_view_has_no_missing_points() -> None:
     assert missing_points(query, replace(candidate, view=empty), np.eye(4)) == MissingPoints(0, 0)
     assert missing_regions(query, replace(candidate, view=empty), np.eye(4)) == MissingRegions(0, 0, 0)
     assert MissingPoints(0, 0).missing_share == MissingRegions(0, 0, 0).missing_share == 0.0
+
+
+def test_what_is_gone_is_of_the_old_view_only() -> None:
+    """One side of the old view shows what the new one does not; what is new there does not count."""
+    query, candidate = sights(5, T_C_Q)
+    where = candidate.view.uv[:, 0] > 0.1
+    old = changed(candidate, where)
+    gone = gone_regions(old, query, se3.inverse(bodies(T_C_Q)))
+    both = missing_regions(query, old, bodies(T_C_Q))
+    assert gone.missing_share > 0.05
+    assert gone.missing < both.missing
+    assert gone_regions(candidate, query, se3.inverse(bodies(T_C_Q))).missing == 0

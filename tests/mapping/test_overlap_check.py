@@ -11,7 +11,8 @@ from share.mapping.atlas import Atlas
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.loops import Loop
-from share.mapping.overlap_check import JoinProbation, MissingRegions
+from share.mapping.missing_points import MissingRegions
+from share.mapping.overlap_check import SAME_DAY, Comparison, JoinProbation
 from share.mapping.recognition.verification import CameraView
 from share.types import F64, U8, View
 
@@ -78,6 +79,28 @@ class Room:
         return [self.atlas.propose(x) for x in loops]
 
 
+class NextDay(Room):
+    """The atlas has what a saw, of an earlier session; b comes today."""
+
+    def __init__(self, today: Ring) -> None:
+        super().__init__((Ring(), today))
+        a, self.b = self.walkers
+        for i, keyframe in enumerate(a.keyframes):
+            number = self.atlas.add_keyframe(a.name, keyframe)
+            self.sights[number] = self.rings[0].camera_view(a.truth[i], self.rng)
+        self.atlas._overlap_check.note_restored(len(a.keyframes))
+
+    def come(self, first: int, last: int) -> list[LoopDecision]:
+        """Add keyframes first .. last - 1 of b; return the decisions of the reviews."""
+        decisions = []
+        for i in range(first, last):
+            number = self.atlas.add_keyframe(self.b.name, self.b.keyframes[i])
+            self.sights[number] = self.rings[1].camera_view(self.b.truth[i], self.rng)
+            decisions.append(self.atlas.loop_acceptance.review_joins(number))
+            self.atlas.renewal.review(number)
+        return [d for d in decisions if d is not None]
+
+
 def some(*posters: int) -> NDArray[np.bool_]:
     return np.isin(np.arange(40), posters)
 
@@ -105,14 +128,14 @@ def test_recognised_places_do_not_hide_missing_regions() -> None:
 
 def test_views_in_which_much_is_found_too_seldom_add_up() -> None:
     """As of a copy that has everything, in other light or a little elsewhere."""
-    true, copy = MissingRegions(100, 0, 70), MissingRegions(100, 0, 45)
+    true, copy = (Comparison(MissingRegions(100, 0, found), SAME_DAY) for found in (70, 45))
     probation = JoinProbation()
     for _ in range(20):
-        probation.add(copy, 0.06)
+        probation.add(copy)
     assert probation.missing == 0.0
     assert probation.lost == pytest.approx(2.0)
     for _ in range(20):
-        probation.add(true, 0.06)
+        probation.add(true)
     assert probation.lost == 0.0
 
 
@@ -139,3 +162,41 @@ def test_overlap_pairs_requires_more_overlap() -> None:
         decision = room.propose(room.loops(range(0, 5)))[-1]
         assert decision.accepted is accepted
         assert ("only 5 views overlap" in decision.reason) is not accepted
+
+
+GONE = (12, 17, 22, 27, 32)  # one poster in five
+
+
+def test_what_is_missing_since_another_day_undoes_no_merge() -> None:
+    """On one day it would not even be made."""
+    today = Ring().copy(some(0, 1, 13, 14, 26, 27))
+    room = NextDay(today)
+    room.come(0, 12)
+    assert room.propose(room.loops(range(0, 12, 3)))[-1].accepted
+    room.solve()
+    assert room.come(12, 50) == []
+    same_day = Room((Ring(), today))
+    same_day.walk(0, 12)
+    assert not same_day.propose(same_day.loops(range(0, 12, 3)))[-1].accepted
+
+
+def test_a_copy_is_told_on_another_day_where_most_differs() -> None:
+    room = NextDay(Ring().copy(some(*range(16, 36))))
+    room.come(0, 12)
+    assert room.propose(room.loops(range(0, 12, 3)))[-1].accepted
+    assert len(room.come(12, 40)) == 1
+    assert room.atlas.renewal.take_gone() == []
+
+
+def test_keyframes_that_show_what_is_gone_leave_the_map_after_probation() -> None:
+    room = NextDay(Ring().copy(some(*GONE)))
+    room.come(0, 12)
+    room.propose(room.loops(range(0, 12, 3)))
+    room.solve()
+    room.come(12, 40)
+    assert room.atlas._overlap_check.is_on_probation(1)
+    assert room.atlas.renewal.take_gone() == []
+    room.atlas._overlap_check._probations.clear()
+    room.come(40, 60)
+    gone = room.atlas.renewal.take_gone()
+    assert gone and room.atlas.renewal.take_gone() == []

@@ -296,6 +296,16 @@ def test_a_pose_that_features_leave_uncertain_is_found_by_the_images(pairs) -> N
         assert align_unsure(refused, query, candidate) is refused
 
 
+def test_a_pose_that_the_images_leave_uncertain_too_is_refused(
+    pairs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true, query, candidate = pairs[0]
+    refused = Refusal("uncertain", (true,))
+    assert isinstance(align_unsure(refused, query, candidate), Verification)
+    monkeypatch.setattr(patch_alignment, "_MAX_SIGMA_DEG", 0.01)
+    assert align_unsure(refused, query, candidate) is refused
+
+
 def test_two_poses_by_which_the_images_align_are_none(pairs, monkeypatch: pytest.MonkeyPatch) -> None:
     true, query, candidate = pairs[0]
     off = true @ se3.exp(10 * OFF)

@@ -13,7 +13,7 @@ from helpers.hellos import hello_of
 from share.config import Config
 from share.geometry import se3
 from share.mapping.graph.solver import PoseGraphSolver
-from share.mapping.map_changes import MapChange, SaveKeyframe, SaveRun, StoredMap
+from share.mapping.map_changes import MapChange, RemoveKeyframes, SaveKeyframe, SaveRun, StoredMap
 from share.mapping.mapper import Mapper
 from share.mapping.recognition import verification
 from share.protocol.peer import restored_runs
@@ -112,6 +112,22 @@ def test_a_restored_mapper_has_the_same_maps_and_continues(tmp_path: Path, most:
             second.step(person)
     assert len(second.mapper.report()["maps"]) == len(before["maps"])
     assert second.mapper.report()["loops"]["accepted"] > 0
+
+
+def test_keyframes_that_show_what_is_gone_are_removed_with_the_next_one(tmp_path: Path) -> None:
+    """Also from the file; what a new keyframe stands for is compared only where it is from today."""
+    session, people = after_a_walk(Config())
+    second = restarted(session, tmp_path / "room.sqlite", Config())
+    atlas, removed = second.mapper.atlas, [5, 6]
+    keys = [atlas.key(n) for n in removed]
+    second.work()
+    atlas.renewal._gone = dict.fromkeys(removed)
+    second.step(people[0])
+    assert not {*removed} & atlas.graph.poses.keys()
+    changes = [change for change in second.changes if isinstance(change, RemoveKeyframes)]
+    assert {key for change in changes for key in change.keys} == {*keys}
+    assert atlas._overlap_check.is_earlier(7)
+    assert not atlas._overlap_check.is_earlier(max(atlas.graph.poses))
 
 
 @pytest.mark.long

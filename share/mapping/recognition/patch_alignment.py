@@ -51,6 +51,7 @@ _FLOOR_DEG, _FLOOR_M = 0.02, 0.001
 # degrees of freedom) are below 6 at 0.3 m, 15 at 1.2 m, 25 at 2 m, 75 at 3 m (three emulated sessions).
 _WIDE_VARIANCE_PER_M2 = 0.5
 _UNALIGNED_VARIANCE = 10.0  # factor on that of a pair whose patches do not align: NEES of 17 to 116 measured
+_MAX_SIGMA_DEG = 1.0  # of a pose that features leave uncertain; vaguer ones are worse than none
 _SAME_CHI2 = 22.5  # 99.9 %, 6 degrees of freedom
 _SHARED_ERROR = 2.0  # factor on sigma in the graph: the loops of a keyframe share its depths' errors
 
@@ -160,7 +161,7 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
 
 def align_unsure(refused: Refusal, query: ImageView, candidate: ImageView) -> Verification | Refusal:
     """Return the pose of a pair whose features do not determine one, by aligning the images from each pose
-    that they allow; the refusal where that fails, or gives two poses."""
+    that they allow; the refusal where that fails, gives two poses, or one that is uncertain too."""
     found: list[Verification] = []
     for T_c_q in refused.unsure_poses:
         aligned = _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
@@ -168,7 +169,8 @@ def align_unsure(refused: Refusal, query: ImageView, candidate: ImageView) -> Ve
             found.append(aligned)
     if not found or any(_differ(found[0], other) for other in found[1:]):
         return refused
-    return found[0]
+    is_sure = np.degrees(se3.rotation_sigma(found[0].cov)) <= _MAX_SIGMA_DEG
+    return found[0] if is_sure else refused
 
 
 def _differ(a: Verification, b: Verification) -> bool:
