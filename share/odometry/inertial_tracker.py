@@ -85,7 +85,7 @@ class InertialTracker:
         self._new_segment = False  # the next keyframe begins a segment
         self._keyframes = KeyframeScheduler(config)
         self._realignment = TiltRealignment()
-        self._start_cov = np.zeros((6, 6))  # of the pose in odom where the filter began
+        self._start_cov: F64 | None = None  # of the pose in odom where the filter began; None: exact
         self._local_map = LocalMap()  # for relocalisation
         self._tracker_config = tracker_config
         self._round_robin = relocalisation.RoundRobin()
@@ -245,7 +245,7 @@ class InertialTracker:
         s = landmarks.state
         self._landmarks, self._has_published, self._lost_ns = landmarks, False, None
         self._start_ns = s.stamp_ns  # by the IMU's clock
-        self._start_cov = np.zeros((6, 6)) if new_segment else relocalisation.POSE_COV
+        self._start_cov = None if new_segment else relocalisation.POSE_COV
         self._mono_window = start_mono_window(s, self._rig.cam0, self._imu.noise, self._config)
         self._rest = RestDetector()
         self._new_segment = new_segment
@@ -332,10 +332,9 @@ class InertialTracker:
             self._realignment.start(s, new_segment)
         else:
             self._realignment.update(s)
-        pose = self._published_pose(s)
-        cov = se3.compose_cov(
-            se3.inverse(s.T_origin) @ s.T, self._start_cov, filter.motion_cov_since_origin(s)
-        )
+        pose, cov = self._published_pose(s), filter.motion_cov_since_origin(s)
+        if self._start_cov is not None:
+            cov = se3.compose_cov(se3.inverse(s.T_origin) @ s.T, self._start_cov, cov)
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)

@@ -217,8 +217,8 @@ class KeyframeScheduler:
         return EarlierPoses(np.array(stamps_ns, np.int64), T.astype(np.float32), cov.astype(np.float32))
 
     def process_pending(self, landmarks: LandmarkMap, frame: Frame, rate: F64) -> OfferedKeyframe | None:
-        """Run the slices that there is time for after `frame`, the frame just tracked; at least one. Once a
-        frame.
+        """Run the slices that there is time for after `frame`, the frame just tracked; at least one, but none
+        beside publishing, which takes the time of one. Once a frame.
 
         Return the keyframe offered since the last call, if any.
         """
@@ -227,12 +227,12 @@ class KeyframeScheduler:
             # Not before: making its candidate might have failed.
             self._last_published.update(landmarks.state, offered.keyframe_id)
             self._published[offered.keyframe_id] = offered.frame.stamp_ns
-        slices = self._slice_count(frame)
+        slices = max(1, self._slice_count(frame))
         if self._to_publish is not None:  # it was published, or not asked for
             self._to_publish = None
-            slices -= 1  # publishing took the time of one
+            slices -= 1
         self._processed_ns = frame.stamp_ns
-        for _ in range(max(1, slices)):
+        for _ in range(slices):
             if not self._slices:
                 break
             self._run_slice(landmarks, frame, rate)
@@ -240,7 +240,7 @@ class KeyframeScheduler:
 
     def _slice_count(self, frame: Frame) -> int:
         """Return the number of slices that there is time for after the frame just tracked."""
-        return int(max(1, (frame.stamp_ns - self._processed_ns) // _SLICE_PERIOD_NS))
+        return int((frame.stamp_ns - self._processed_ns) // _SLICE_PERIOD_NS)
 
     def reset(self) -> None:
         """Drop all pending work: the filter begins anew, with new keyframe ids."""

@@ -33,14 +33,14 @@ class TiltRealignment:
         """Compensate the tilt of the origin that the filter has changed since the start; turn odom a little
         upright."""
         T_start_filter = self._T_start_origin @ se3.inverse(s.T_origin)
-        self.T_odom_filter = se3.orthonormal(self._T_odom_start @ T_start_filter)
+        self.T_odom_filter = self._T_odom_start @ T_start_filter
         remaining = _small_rotation(self.T_odom_filter[:3, :3])
         angle = float(np.linalg.norm(remaining))
         if angle:
             step_rad = _UPRIGHT_RAD_S * 1e-9 * (s.stamp_ns - self._stamp_ns)
             body = self.published_pose(s.T)[:3, 3]
             turn = _rotation_about(body, -remaining * min(step_rad / angle, 1.0))
-            self._T_odom_start = se3.orthonormal(turn @ self._T_odom_start)
+            self._T_odom_start = turn @ self._T_odom_start
             self.T_odom_filter = turn @ self.T_odom_filter
         self._stamp_ns = s.stamp_ns
 

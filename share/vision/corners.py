@@ -74,9 +74,10 @@ def _peaks(image: U8) -> tuple[I64, F32]:
     """Return corners (N, 2) px that are local maxima, and their strength (N,)."""
     strength = cv2.cornerMinEigenVal(image, _BLOCK_PX)
     local_max = cv2.dilate(strength, np.ones((_SUPPRESSION_PX, _SUPPRESSION_PX), np.uint8))
-    peak = (strength == local_max) & (strength > _MIN_EIGENVALUE)
-    peak[:_BORDER_PX] = peak[-_BORDER_PX:] = peak[:, :_BORDER_PX] = peak[:, -_BORDER_PX:] = False
-    found = cv2.findNonZero(peak.view(np.uint8))  # five times as fast as np.nonzero
+    peak = cv2.compare(strength, local_max, cv2.CMP_EQ)
+    peak &= cv2.compare(strength, _MIN_EIGENVALUE, cv2.CMP_GT)
+    peak[:_BORDER_PX] = peak[-_BORDER_PX:] = peak[:, :_BORDER_PX] = peak[:, -_BORDER_PX:] = 0
+    found = cv2.findNonZero(peak)  # five times as fast as np.nonzero
     px = np.zeros((0, 2), np.int64) if found is None else found.reshape(-1, 2).astype(np.int64)
     return px, strength[px[:, 1], px[:, 0]]
 
