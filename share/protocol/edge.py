@@ -57,12 +57,11 @@ class Edge:
         self._registry, self._unjoined = RunRegistry(), Sender()
         self.latest_poses = self._registry.latest_poses
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
-        self._admission = Admission(config.edge, self.tracks_agents)
+        self._admission = Admission(config.edge, self.tracks_agents, self._rate_scheduler.objection)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._event_log, self._version_throttle = EventLog(began_ns), Throttle(_VERSION_REFUSAL_HZ, 1.0)
         self._durability, self._internal_errors = DurabilityTracker(has_store), 0
         self._effects: list[ed.EdgeEffect] = []
-        self._full_reason: str | None = None  # why nobody, or no robot, can join
         self._now_ns = 0  # of the event that is being handled
         for run in restored:
             self._registry.restore(run)
@@ -174,14 +173,8 @@ class Edge:
         report = AgentReport(peer.hello.kind, evaluation, self._now_ns, *arrived, *service)
         t_s = self._event_log.elapsed_s(self._now_ns)
         self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
-        self._note_full_room()
-
-    def _note_full_room(self) -> None:
-        """Record that one more agent finds no room, or does again."""
-        reason = self._rate_scheduler.full_reason(self._now_ns)
-        if (reason is None) != (self._full_reason is None):
-            self._record("room full", None, reason or "there is room again")
-        self._full_reason = reason
+        if (news := self._rate_scheduler.capacity_news(self._now_ns)) is not None:
+            self._record("room full", None, news)
 
     def _send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
@@ -212,10 +205,7 @@ class Edge:
         self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        if (reason := self._admission.objection(event, hello, self._registry, self._now_ns)) is not None:
-            return reason
-        is_known = event.peer_id in self._registry
-        return None if is_known else self._rate_scheduler.objection(hello.name, hello.kind, self._now_ns)
+        return self._admission.objection(event, hello, self._registry, self._now_ns)
 
     def _make_room(self, peer: Peer) -> None:
         """Send away who has to leave for a run that has joined."""
@@ -269,8 +259,7 @@ class Edge:
 
     def _capacity_objection(self, peer: Peer) -> str | None:
         """Return why a run that left may not come back; None if it may."""
-        full = self._admission.capacity_objection(peer.hello, self._registry, self._now_ns)
-        return full or self._rate_scheduler.objection(peer.name, peer.hello.kind, self._now_ns)
+        return self._admission.capacity_objection(peer.hello, self._registry, self._now_ns)
 
     def _readmit(self, peer: Peer) -> None:
         self._supersede(peer.name)
