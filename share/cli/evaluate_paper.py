@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("sessions", nargs=-1, type=options.PATH)
-@click.option("--quick", is_flag=True, help="Two sessions of 20 s at 15 Hz, few gains: minutes, not a day.")
+@click.option(
+    "--quick", is_flag=True, help="One session of 20 s at 15 Hz, two values of each gain: minutes, not a day."
+)
 @click.option(
     "--with",
     "scores_file",

@@ -50,7 +50,6 @@ class Edge(RoomMembership):
         self.latest_poses = self._registry.latest_poses
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._version_throttle, self._internal_errors = Throttle(_VERSION_REFUSAL_HZ, 1.0), 0
-        self._full_reason: str | None = None  # why nobody, or no robot, can join
 
     def handle(self, event: ed.EdgeEvent, now_ns: int) -> list[ed.EdgeEffect]:
         """Return the effects of `event`. now_ns: the edge's clock, never falling.
@@ -139,14 +138,8 @@ class Edge(RoomMembership):
         report = AgentReport(peer.hello.kind, evaluation, self._out.now_ns, *arrived, *service)
         t_s = self._out.elapsed_s
         self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
-        self._note_full_room()
-
-    def _note_full_room(self) -> None:
-        """Record that one more agent finds no room, or does again."""
-        reason = self._rate_scheduler.full_reason(self._out.now_ns)
-        if (reason is None) != (self._full_reason is None):
-            self._out.record("room full", None, reason or "there is room again")
-        self._full_reason = reason
+        if (news := self._rate_scheduler.capacity_news(self._out.now_ns)) is not None:
+            self._out.record("room full", None, news)
 
     def _on_other_version(self, peer_id: bytes, error: VersionError) -> None:
         self._registry.unjoined.counts["other_version"] += 1

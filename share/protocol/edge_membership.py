@@ -38,7 +38,7 @@ class RoomMembership:
         self._config, self._session, self._registry = config, session, RunRegistry()
         self._out = EdgeOutput(self._registry, has_store, began_ns)
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
-        self._admission = Admission(config.edge, self.tracks_agents)
+        self._admission = Admission(config.edge, self.tracks_agents, self._rate_scheduler.objection)
         for run in restored:
             self._registry.restore(run)
 
@@ -52,10 +52,7 @@ class RoomMembership:
         self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        if (reason := self._admission.objection(event, hello, self._registry, self._out.now_ns)) is not None:
-            return reason
-        is_known = event.peer_id in self._registry
-        return None if is_known else self._rate_scheduler.objection(hello.name, hello.kind, self._out.now_ns)
+        return self._admission.objection(event, hello, self._registry, self._out.now_ns)
 
     def _make_room(self, peer: Peer) -> None:
         """Send away who has to leave for a run that has joined."""
@@ -110,8 +107,7 @@ class RoomMembership:
 
     def _capacity_objection(self, peer: Peer) -> str | None:
         """Return why a run that left may not come back; None if it may."""
-        full = self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
-        return full or self._rate_scheduler.objection(peer.name, peer.hello.kind, self._out.now_ns)
+        return self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
 
     def _readmit(self, peer: Peer) -> None:
         self._supersede(peer.name)

@@ -36,6 +36,7 @@ class RateScheduler:
         self._config, self._policy = config, POLICIES[policy](config)
         self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
         self.is_windowed = self._policy.is_windowed
+        self._is_full = False
         self._history: dict[str, RingBuffer] = {}  # of all runs of a name
         self._latest: dict[str, RatedEvaluation] = {}  # of the present run
         self._low_since_s: dict[str, float] = {}  # of the present run, while its QoE is low
@@ -66,6 +67,11 @@ class RateScheduler:
     def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
         """Return who has to leave for an agent that joins, by name."""
         return self._policy.displaced(agent, kind, now_ns)
+
+    def capacity_news(self, now_ns: int) -> str | None:
+        """Return why one more agent finds no room, or that it does again, where that has changed."""
+        was_full, self._is_full = self._is_full, (reason := self.full_reason(now_ns)) is not None
+        return None if was_full == self._is_full else reason or "there is room again"
 
     def full_reason(self, now_ns: int) -> str | None:
         """Return why nobody, or no robot, can join now, for a person; None if all can."""

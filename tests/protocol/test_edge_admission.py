@@ -297,3 +297,41 @@ def test_a_full_room_is_recorded_once(full_edge):
         if isinstance(effect, ed.WriteEvent)
     ]
     assert [(r["event"], r["reason"]) for r in records] == [("room full", "no air for one more robot")]
+
+
+def evaluated(edge, kinds, seconds=12):
+    """Agents of these kinds that a keyframe takes 60 ms of air, of 120 ms in all; evaluated every second."""
+    for k, kind in enumerate(kinds):
+        tell(edge, k + 1, hello_of(f"a{k}", k + 1, kind=kind))
+    for second in range(1, seconds + 1):
+        for k in range(len(kinds)):
+            told = m.Evaluation(-1, 120.0, 1.0, track_ms=10.0, rtt_ms=5.0, ack_ms=65.0)
+            tell(edge, k + 1, told, second + 0.01 * k)
+    return seconds + 0.5
+
+
+def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none():
+    headset, bot = [AgentKind.AR], [AgentKind.ROBOT]
+    few = Edge(Config(), 7)
+    now_s = evaluated(few, 8 * headset + 4 * bot)
+    assert refusal(tell(few, 100, robot("late", 100), now_s)) is None
+
+    crowded = Edge(Config(), 7)
+    now_s = evaluated(crowded, 14 * headset + 5 * bot)
+    assert "no air for one more robot" in refusal(tell(crowded, 100, robot("late", 100), now_s))
+    assert "no air left beside headsets" in refusal(come(crowded, "eve", 101, now_s))
+    agents = crowded.report({})["agents"]
+    assert not agents["eve"]["gone"]
+    assert [name for name, agent in agents.items() if agent["gone"]] == ["a17", "a18"]
+
+    full = Edge(Config(), 7)
+    now_s = evaluated(full, 20 * headset)
+    assert "no air for one more headset" in refusal(come(full, "eve", 101, now_s))
+    assert refusal(come(full, "eve", 101, now_s + 60)) is None  # all others have fallen silent
+
+
+def test_policies_without_a_budget_turn_nobody_away():
+    config = Config(edge=EdgeConfig(policy="covins-g"))
+    edge = Edge(config, 7)
+    now_s = evaluated(edge, [AgentKind.AR] * 20)
+    assert refusal(come(edge, "eve", 101, now_s)) is None

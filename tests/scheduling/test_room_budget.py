@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from helpers.modelled_air import Air
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,37 +36,6 @@ def agent(kind: AgentKind = AR, keyframe_ms: float = 40.0, **given: float) -> Ag
 
 def room(*agents: AgentAir) -> RoomBudget:
     return RoomBudget({f"a{k}": one for k, one in enumerate(agents)})
-
-
-class Air:
-    """A channel on which a keyframe alone takes `alone_ms`: what each agent reports and is granted."""
-
-    def __init__(self, alone_ms: float, kinds: tuple[AgentKind, ...], wanted_hz: float = 1.5) -> None:
-        self.alone_ms, self.kinds, self.wanted_hz = alone_ms, kinds, wanted_hz
-        self.room, self.now_s = RoomController(), 0.0
-        self.counts = [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
-        self.grants = [first_grant(kind) for kind in kinds]
-        self.history: list[list[float]] = []
-
-    def load(self) -> float:
-        poses = sum(30.0 if g.pose_hz is None else g.pose_hz for g in self.grants)
-        return min(0.98, self.alone_ms / 1e3 * (sum(g.hz for g in self.grants) + 0.017 * poses))
-
-    def play(self, seconds: float) -> None:
-        end = self.now_s + seconds
-        while self.now_s < end:
-            self.now_s += 0.5
-            keyframe_ms = self.alone_ms / (1 - self.load())
-            for k, kind in enumerate(self.kinds):
-                sent, pose_hz = self.grants[k].hz, self.grants[k].pose_hz
-                self.counts[k][0] += 0.5 * sent
-                self.counts[k][1] += 0.5 * (30.0 if pose_hz is None else pose_hz)
-                told = Evaluation(0, 60 + keyframe_ms, 1.2, 10.0, 5.0, 5 + keyframe_ms, 0.5)
-                counts = round(self.counts[k][0]), round(self.counts[k][1])
-                self.grants[k] = self.room.grant(
-                    f"a{k}", TERMS[kind], self.wanted_hz, told, keyframe_ms, counts, round(self.now_s * S)
-                )
-            self.history.append([g.hz for g in self.grants])
 
 
 def test_an_agent_whose_air_is_not_known_starts_slowly() -> None:

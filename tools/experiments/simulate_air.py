@@ -1,18 +1,22 @@
 """Policies where all agents share the air of one access point, in virtual time with modelled mapping.
 
     python tools/experiments/simulate_air.py [--agents 12] [--air shared-5 shared-8] [--seeds 501:511] \\
-        [--policies share covins-g fixed@1.5] [--halved 30:50] [--set SECTION.NAME=VALUE] [--json FILE]
+        [--policies share covins-g fixed@1.5] [--halved 30:50] [--late 20] [--seconds 60] \\
+        [--set SECTION.NAME=VALUE] [--json FILE]
 
 Two headsets per robot walk for a minute in a warehouse that grows with their number; frames at 30 Hz,
 keyframes of 27 kB. `fixed@HZ`: policy fixed at this rate. `--halved A:B`: the air has half its rate from A to
-B s. Prints a Markdown table, means over seeds. How agents are served is sampled twice a second from the
-agents themselves, from their first keyframe to the end, whether or not the edge hears of it:
+B s. `--late S`: the second half of the agents comes after S s. Prints a Markdown table, means over seeds. How
+agents are served is sampled twice a second from the agents themselves, from their first keyframe to the end,
+whether or not the edge hears of it:
 
 * QoE of headsets and robots: mean, and the 5th percentile over a run's samples of all headsets; of the
   delay until corrections (a keyframe that is not acknowledged counts as late as it is) and the expected
   error. `by round trip`: of headsets, with round trip and processing as delay, or how long a keyframe has
   not been acknowledged, if longer: that of earlier figures.
 * corrections of headsets, 95th percentile, ms; age of a headset's newest correction, 95th percentile, s.
+* Jain's index of headsets' QoE: 1 where all are served alike. Corrections a hundred frames of headsets: to
+  send nothing would be best by the mean latency.
 * error of poses in the shared map, cm rms; keyframes a second of all; load of the air.
 """
 
@@ -51,7 +55,16 @@ from share.scheduling.qoe import QoeParameters, qoe  # noqa: E402
 from share.types import AgentKind  # noqa: E402
 
 HEAD = ("air", "policy", "AR QoE: mean, p5", "by round trip", "robot QoE", "AR corrections p95, ms")
-HEAD += ("AR age p95, s", "cm: AR, robots", "sent Hz: AR, robots", "air", "maps", "took s")
+HEAD += (
+    "Jain",
+    "a 100 frames",
+    "AR age p95, s",
+    "cm: AR, robots",
+    "sent Hz: AR, robots",
+    "air",
+    "maps",
+    "took s",
+)
 _SAMPLE_TICKS = 10  # of 50 ms
 
 Row = dict[str, Any]
@@ -63,6 +76,7 @@ class SampledSimulation(Simulation):
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         self.samples: dict[str, list[tuple[float, ...]]] = {}
+        self.arrivals_s: dict[str, float] = {}  # of agents that are late
         self._corrected_s: dict[str, float] = {}
         self._ticks = 0
         super().__init__(*arguments, **{**named, "on_effect": self._note})
@@ -79,9 +93,13 @@ class SampledSimulation(Simulation):
                     now_s, hz = 1e-9 * self.now_ns, member.machine.report()["rate_hz"]
                     trip_ms = max(found.rtt_ms + found.track_ms, _waiting_ms(member.machine, self.now_ns))
                     sampled = now_s, found.delay_ms, trip_ms, found.error_cm or math.nan
-                    age_s = now_s - self._corrected_s.get(member.name, 0.0)
+                    age_s = now_s - self._corrected_s.get(member.name, self.arrivals_s.get(member.name, 0.0))
                     self.samples.setdefault(member.name, []).append((*sampled, hz or math.nan, age_s))
         super()._tick()
+
+    def _to_agent(self, member: Any, event: ev.AgentEvent) -> None:
+        if 1e-9 * self.now_ns >= self.arrivals_s.get(member.name, 0.0):
+            super()._to_agent(member, event)
 
     def call_at(self, t_s: float, action: Any) -> None:
         """Call `action` at a time of the simulation."""
@@ -103,6 +121,8 @@ def main() -> int:
     parser.add_argument("--seeds", default="401:403", metavar="FIRST:END")
     parser.add_argument("--policies", nargs="+", default=["share", "covins-g", "fixed@1.5"])
     parser.add_argument("--halved", metavar="A:B")
+    parser.add_argument("--late", type=float, metavar="S")
+    parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -115,10 +135,10 @@ def simulate(options: argparse.Namespace) -> None:
     configs = {policy: with_policy(policy, options.set) for policy in options.policies}
     rows: list[Row] = []
     for seed in range(first, end):
-        made = scarce_room(options.agents, seed)
+        made = scarce_room(options.agents, seed, options.seconds)
         for air in options.air:
             for policy, config in configs.items():
-                rows.append({"policy": policy, **play(made, config, air, seed, options.halved)})
+                rows.append({"policy": policy, **play(made, config, air, seed, options.halved, options.late)})
                 if options.json:
                     options.json.write_text(json.dumps(rows) + "\n")
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))))
@@ -148,13 +168,22 @@ def begin(
     return kind(config, members, ProcessingDelays(), seed, mapper), truth, seconds
 
 
-def play(made: KeyframeSet, config: Config, air: str, seed: int, halved: str | None = None) -> Row:
+def play(
+    made: KeyframeSet,
+    config: Config,
+    air: str,
+    seed: int,
+    halved: str | None = None,
+    late_s: float | None = None,
+) -> Row:
     """Simulate one run."""
     began = time.monotonic()
     who = list(made.agents.values())
     world, truth, seconds = begin(SampledSimulation, made, config, air, seed)
     if halved is not None:
         _halve(world, *map(float, halved.split(":")))
+    if late_s is not None:
+        world.arrivals_s = dict.fromkeys(list(made.agents)[len(who) // 2 :], late_s)
     world.run(seconds)
     return {
         "air": air,
@@ -192,6 +221,7 @@ def _agent_row(world: SampledSimulation, name: str, config: Config) -> Row:
         "age_s": samples[:, 5].tolist(),
         "corrected_ms": corrected_ms[corrected_ms > 0].tolist(),
         "sent": world.reports()[name]["sent"],
+        "frames": len(world.logs[name].frames().corrected_ms),
     }
 
 
@@ -203,6 +233,24 @@ def pooled(row: Row, kind: str, figure: str) -> np.ndarray[Any, Any]:
     """Return a figure of all agents of a kind in one run, joined."""
     found = [np.atleast_1d(a[figure]) for name, a in row["agents"].items() if name.startswith(kind)]
     return np.concatenate(found) if found else np.array([math.nan])
+
+
+def mean_qoe(row: Row, kind: str) -> np.ndarray[Any, Any]:
+    """Return the mean QoE of each agent of a kind that was there."""
+    found = [agent["qoe"] for name, agent in row["agents"].items() if name.startswith(kind) and agent["qoe"]]
+    return np.array([np.mean(qoe) for qoe in found])
+
+
+def jain(values: np.ndarray[Any, Any]) -> float:
+    """Return Jain's fairness index (R. Jain, D. Chiu, W. Hawe, DEC-TR-301, 1984): 1 where all are equal, 1/n
+    where one has everything; NaN of none."""
+    square = len(values) * float((values**2).sum())
+    return float(values.sum()) ** 2 / square if square else math.nan
+
+
+def corrections_a_100_frames(row: Row) -> float:
+    """Return how many of a hundred frames of headsets led to a correction."""
+    return float(100 * len(pooled(row, "ar", "corrected_ms")) / max(1, pooled(row, "ar", "frames").sum()))
 
 
 def cells_of(rows: list[Row]) -> list[str]:
@@ -230,6 +278,8 @@ def cells_of(rows: list[Row]) -> list[str]:
         f"{over_runs(lambda r: np.percentile(pooled(r, 'ar', 'qoe_by_round_trip'), 5)):.3f}",
         f"{over_runs(lambda r: pooled(r, 'robot', 'qoe').mean()):.3f}",
         f"{over_runs(lambda r: p95(pooled(r, 'ar', 'corrected_ms'))):.0f}",
+        f"{over_runs(lambda r: jain(mean_qoe(r, 'ar'))):.3f}",
+        f"{over_runs(corrections_a_100_frames):.2f}",
         f"{over_runs(lambda r: p95(pooled(r, 'ar', 'age_s'))):.1f}",
         f"{over_runs(lambda r: error_cm(r, 'ar')):.2f}, {over_runs(lambda r: error_cm(r, 'robot')):.2f}",
         f"{over_runs(lambda r: sent_hz(r, 'ar')):.2f}, {over_runs(lambda r: sent_hz(r, 'robot')):.2f}",

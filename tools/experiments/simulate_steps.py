@@ -31,7 +31,6 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.lab.evaluate.charts import draw_lines  # noqa: E402
-from share.protocol import agent_events as ev  # noqa: E402
 from share.protocol import edge_events as ed  # noqa: E402
 from share.types import F64  # noqa: E402
 
@@ -45,10 +44,9 @@ Row = dict[str, Any]
 
 
 class SteppedSimulation(SampledSimulation):
-    """A simulation in which agents arrive late and the edge pauses."""
+    """A simulation in which the edge pauses."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
-        self.arrivals_s: dict[str, float] = {}  # of agents that are late
         self._paused_until_s = 0.0
         self._waiting: list[ed.EdgeEvent] = []
         super().__init__(*arguments, **named)
@@ -68,10 +66,6 @@ class SteppedSimulation(SampledSimulation):
             self._waiting.append(event)
         else:
             super()._to_edge(event)
-
-    def _to_agent(self, member: Any, event: ev.AgentEvent) -> None:
-        if 1e-9 * self.now_ns >= self.arrivals_s.get(member.name, 0.0):
-            super()._to_agent(member, event)
 
 
 def main() -> int:

@@ -1,0 +1,62 @@
+"""A channel that all agents of a room share, without messages: what each reports and is granted."""
+
+from __future__ import annotations
+
+from share.config import ControlConfig
+from share.scheduling.qoe import QoeParameters
+from share.scheduling.room_budget import first_grant
+from share.scheduling.room_controller import RoomController
+from share.types import AgentKind
+from share.wire.messages import Evaluation
+
+S = 1_000_000_000
+STEP_S = 0.5
+TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in AgentKind}
+
+
+class Air:
+    """A channel on which a keyframe alone takes `alone_ms`. history: rates of all agents every 0.5 s."""
+
+    def __init__(self, alone_ms: float, kinds: tuple[AgentKind, ...], wanted_hz: float = 1.5) -> None:
+        self.alone_ms, self.wanted_hz = alone_ms, wanted_hz
+        self.room, self.now_s = RoomController(), 0.0
+        self.kinds: list[AgentKind] = []
+        self.counts: list[list[float]] = []
+        self.grants = [first_grant(kind) for kind in kinds]
+        self.history: list[list[float]] = []
+        self.join(kinds)
+
+    def join(self, kinds: tuple[AgentKind, ...]) -> None:
+        """Let agents join at once."""
+        self.grants = [*self.grants[: len(self.kinds)], *(first_grant(kind) for kind in kinds)]
+        self.kinds += kinds
+        self.counts += [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
+
+    def load(self) -> float:
+        poses = sum(30.0 if g.pose_hz is None else g.pose_hz for g in self.grants)
+        return min(0.98, self.alone_ms / 1e3 * (sum(g.hz for g in self.grants) + 0.017 * poses))
+
+    def play(self, seconds: float) -> None:
+        end = self.now_s + seconds
+        while self.now_s < end:
+            self.now_s += STEP_S
+            self._report(self.alone_ms / (1 - self.load()))
+            self.history.append([g.hz for g in self.grants])
+
+    def pause(self, seconds: float) -> None:
+        """Let the edge hear nothing for a while; then all evaluations of that time at once, late ones."""
+        began_s = self.now_s
+        self.now_s += seconds
+        for waited_s in range(1, int(seconds) + 1):
+            self._report(1e3 * waited_s, began_s + waited_s)
+
+    def _report(self, keyframe_ms: float, sent_s: float | None = None) -> None:
+        for k, kind in enumerate(self.kinds):
+            sent, pose_hz = self.grants[k].hz, self.grants[k].pose_hz
+            if sent_s is None:  # during a pause nothing arrives
+                self.counts[k][0] += STEP_S * sent
+                self.counts[k][1] += STEP_S * (30.0 if pose_hz is None else pose_hz)
+            told = Evaluation(0, 60 + keyframe_ms, 1.2, 10.0, 5.0, 5 + keyframe_ms, 0.5)
+            counts = round(self.counts[k][0]), round(self.counts[k][1])
+            at = f"a{k}", TERMS[kind], self.wanted_hz, told, keyframe_ms, counts, round(self.now_s * S)
+            self.grants[k] = self.room.grant(*at)
