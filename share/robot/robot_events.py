@@ -1,0 +1,216 @@
+"""Events and effects of the robot bridge's state machine.
+
+Its time is the host's monotonic clock, ns. A stamp is in the robot's clock, that of its odometry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from share.robot.planar import PlanarPose
+from share.types import F64, TrackState
+
+# ---------------------------------------------------------------- events
+
+
+@dataclass(frozen=True, eq=False)
+class AgentPoseReceived:
+    """A message of the agent's pose stream.
+
+    T_map_body (4, 4), map_id: None without a pose in the map. sigma_m: standard deviation of the position on the
+    floor; None if the agent does not know it. age_ns: of the frame; None if the agent does not say. has_edge:
+    whether the agent hears its edge; None if it does not say.
+    """
+
+    agent: str
+    sequence: int
+    state: TrackState
+    T_map_body: F64 | None
+    map_id: str | None
+    sigma_m: float | None
+    age_ns: int | None
+    has_edge: bool | None = None
+
+
+@dataclass(frozen=True)
+class OdometryReceived:
+    """The robot's odometry. T_odom_base may have values that are not finite. unix_ns: when it arrived.
+    speed_m_s: as the robot reports it."""
+
+    stamp_ns: int
+    unix_ns: int
+    T_odom_base: PlanarPose
+    speed_m_s: float
+
+
+@dataclass(frozen=True)
+class ForeignMapFrame:
+    """Another program publishes `map → odom`. frame: the child frame."""
+
+    frame: str
+
+
+@dataclass(frozen=True)
+class RobotDiscovered:
+    """What is on the DDS domain: numbers of navigation servers and of publishers of odometry in the robot's
+    namespace; others: namespaces in which there is one of them. release: humble, jazzy, newer; "" unknown."""
+
+    servers: int
+    odometry_publishers: int
+    others: tuple[str, ...] = ()
+    release: str = ""
+
+
+@dataclass(frozen=True)
+class GotoRequested:
+    """A commander wants the robot at x, y (m, in the map). yaw: rad; None: as it arrives. map_id: in which map
+    the goal is meant; None: in the present one. goal_id (16 bytes): its name on the robot, used once."""
+
+    commander: str
+    goal_id: bytes
+    x: float
+    y: float
+    yaw: float | None = None
+    map_id: str | None = None
+
+
+@dataclass(frozen=True)
+class CancelRequested:
+    """A commander, any, wants the robot to stop."""
+
+    commander: str
+
+
+@dataclass(frozen=True)
+class CommanderLost:
+    """The link to a commander is gone."""
+
+    commander: str
+
+
+class GoalStatus(StrEnum):
+    """State of a goal on the robot (action_msgs/GoalStatus)."""
+
+    UNKNOWN = "unknown"
+    ACCEPTED = "accepted"
+    EXECUTING = "executing"
+    CANCELING = "canceling"
+    SUCCEEDED = "succeeded"
+    CANCELED = "canceled"
+    ABORTED = "aborted"
+
+    @property
+    def is_final(self) -> bool:
+        return self in (GoalStatus.SUCCEEDED, GoalStatus.CANCELED, GoalStatus.ABORTED)
+
+
+@dataclass(frozen=True)
+class StatusReceived:
+    """The robot's list of its goals: (goal id, status) of each."""
+
+    goals: tuple[tuple[bytes, GoalStatus], ...]
+
+
+@dataclass(frozen=True)
+class FeedbackReceived:
+    """How far the robot has still to go, m, as it says."""
+
+    goal_id: bytes
+    distance_m: float
+
+
+@dataclass(frozen=True)
+class GoalAnswered:
+    """A reply to a goal; which goal it answers is not known."""
+
+    is_accepted: bool
+
+
+@dataclass(frozen=True)
+class ResultReceived:
+    """Why a goal failed, as the robot says: a code of Nav2, and its text ("" without one)."""
+
+    code: int
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class BridgeTick:
+    """Time passes; at least 20 times a second."""
+
+
+RobotEvent = (
+    AgentPoseReceived
+    | OdometryReceived
+    | ForeignMapFrame
+    | RobotDiscovered
+    | GotoRequested
+    | CancelRequested
+    | CommanderLost
+    | StatusReceived
+    | FeedbackReceived
+    | GoalAnswered
+    | ResultReceived
+    | BridgeTick
+)
+
+# ---------------------------------------------------------------- effects
+
+
+@dataclass(frozen=True)
+class PublishMapOdom:
+    """Publish `map → odom`, valid from the last one until stamp_ns."""
+
+    stamp_ns: int
+    T_map_odom: PlanarPose
+
+
+@dataclass(frozen=True)
+class SendGoal:
+    """Send a goal to the robot's navigation."""
+
+    goal_id: bytes
+    stamp_ns: int
+    T_map_base: PlanarPose
+
+
+@dataclass(frozen=True)
+class CancelGoal:
+    """Ask the robot to give a goal up."""
+
+    goal_id: bytes
+
+
+@dataclass(frozen=True)
+class AskResult:
+    """Ask the robot why a goal failed."""
+
+    goal_id: bytes
+
+
+@dataclass(frozen=True)
+class LimitSpeed:
+    """Ask the robot's controller to drive no faster."""
+
+    speed_m_s: float
+
+
+@dataclass(frozen=True)
+class GoalReport:
+    """What a commander is told of its goal. is_final: nothing follows. is_reached: it ended there."""
+
+    commander: str
+    text: str
+    is_final: bool = False
+    is_reached: bool = False
+
+
+@dataclass(frozen=True)
+class BridgeLine:
+    """One line for a person."""
+
+    text: str
+
+
+RobotEffect = PublishMapOdom | SendGoal | CancelGoal | AskResult | LimitSpeed | GoalReport | BridgeLine
