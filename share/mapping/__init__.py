@@ -4,12 +4,14 @@ Begin with `mapper.Mapper`: `keyframe_lookup.KeyframeLookup.look_up` is a keyfra
 that of a map that has changed:
 
     query_queue          which keyframe is looked up next
+    candidates           which others it is compared with, and how
     recognition          align the images of keyframes nearby (`recognition.patch_alignment`); find others
                          (`recognition.index`), verify (`recognition.verification`) and align them
     agents               do the agents agree on scale and covariances? else quarantine
     loop_acceptance      is a loop accepted: alone, or with others (`loop_consistency`, `overlap_check`)
     map_graph            nodes, edges, and which segments (`segments`) form one map
     map_solving          the job of the solver (`graph`), and what its solution changes
+    map_gauge            what of that is shown: no motion of the whole map that is uncertain
     localisation_gate    is an agent's place known well enough to publish a correction?
     corrections          which agents get one
 

@@ -12,14 +12,13 @@ from typing import Any
 
 from share.config import Config
 from share.mapping.atlas import Atlas
-from share.mapping.candidates import choose_checks, larger_maps_first
+from share.mapping.candidates import choose_checks, larger_maps_first, nearby_candidates
 from share.mapping.corrections import MapEvent
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import SaveView
 from share.mapping.mapper_log import MapperLog
 from share.mapping.query_queue import CandidateSearch, QueryQueue
 from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeViews
-from share.mapping.recognition.nearby import nearby_candidates
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import AlignStep, DescribeStep, IndexStep, Job, QueryStep, VerifyStep
 from share.scheduling.merge_gate import MergeGate

@@ -1,6 +1,11 @@
-"""What the mapper reports: changes to store, events and counters since the last time they were taken."""
+"""What the mapper reports: changes to store and events since they were last taken, and counters (loops and
+merges of each run, steps and their durations)."""
 
 from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Any
 
 from share.errors import describe_exception
 from share.mapping.agents.quarantine import QuarantineChange
@@ -8,7 +13,7 @@ from share.mapping.corrections import MapEvent
 from share.mapping.loop_acceptance import LoopDecision
 from share.mapping.map_changes import MapChange, RemoveLoops, SaveLoop
 from share.mapping.map_solving import AppliedSolution
-from share.mapping.mapper_counters import MapperCounters
+from share.metrics.frame_log import summary
 
 
 class MapperLog:
@@ -43,3 +48,73 @@ class MapperLog:
         """Return the events since the last call."""
         events, self.events = self.events, []
         return events
+
+
+STEP_KINDS = "describe", "index", "place", "verify", "align", "solve"
+_MAX_STEP_TIMES = 5000  # newest durations of each kind of step in a report
+
+
+@dataclass
+class RunCounters:
+    """Counters of one run. merges: `requested`, `skipped`, `done`. newest_id: its newest keyframe."""
+
+    loops_tried: int = 0
+    merges: Counter[str] = field(default_factory=Counter)
+    newest_id: int = -1
+
+    def report(self) -> dict[str, Any]:
+        """The run's fields of edge.json."""
+        return {
+            "loops": {"tried": self.loops_tried, "accepted": self.merges["done"]},
+            "merges": merge_counts(self.merges),
+        }
+
+
+class MapperCounters:
+    """runs: by run. steps: finished steps by kind. removed_keyframes, failed_steps: since the start."""
+
+    def __init__(self) -> None:
+        self.runs: dict[str, RunCounters] = {}
+        self.steps: Counter[str] = Counter()
+        self.removed_keyframes = self.failed_steps = 0
+        self._removed_runs = RunCounters()
+        self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in STEP_KINDS}
+
+    def add_run(self, agent: str) -> None:
+        self.runs[agent] = RunCounters()
+
+    def remove_run(self, agent: str) -> None:
+        """Forget a run; its loops and merges stay in the totals."""
+        counters = self.runs.pop(agent)
+        self._removed_runs.loops_tried += counters.loops_tried
+        self._removed_runs.merges += counters.merges
+
+    def add_step(self, kind: str, ms: float) -> None:
+        self._step_ms[kind].append(ms)
+        self.steps[kind] += 1
+
+    def report(self, pending_count: int, loop_count: int) -> dict[str, Any]:
+        """Totals of all runs and durations of steps, for edge.json. Counts: of loops now in the map."""
+        runs = [*self.runs.values(), self._removed_runs]
+        merges = merge_counts(sum((run.merges for run in runs), Counter()))
+        tried = sum(run.loops_tried for run in runs)
+        return {
+            "loops": {
+                "tried": tried,
+                "accepted": merges["done"],
+                "waiting": pending_count,
+                "in_map": loop_count,
+            },
+            "merges": merges,
+            "removed_keyframes": self.removed_keyframes,
+            "failed_steps": self.failed_steps,
+            **{
+                f"{kind}_ms": {**summary(list(ms)).report(), "n": self.steps[kind]}
+                for kind, ms in self._step_ms.items()
+            },
+        }
+
+
+def merge_counts(merges: Counter[str]) -> dict[str, int]:
+    """Counts of all outcomes, zeros included."""
+    return {outcome: merges[outcome] for outcome in ("requested", "skipped", "done")}

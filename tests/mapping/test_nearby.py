@@ -8,8 +8,8 @@ import pytest
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.atlas import Atlas
+from share.mapping.candidates import nearby_candidates
 from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.recognition.nearby import nearby_candidates
 from share.types import Keyframe, View
 
 COV = 1e-6 * np.eye(6)
