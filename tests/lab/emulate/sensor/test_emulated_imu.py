@@ -23,7 +23,7 @@ SENSORS = {
 @pytest.mark.parametrize(
     "name",
     [
-        "BMI055 gyro",
+        pytest.param("BMI055 gyro", marks=pytest.mark.slow),
         pytest.param("BMI055 accel", marks=pytest.mark.slow),
         pytest.param("ADIS gyro", marks=pytest.mark.slow),
         "ADIS accel",
