@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from statistics import median
 
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
 from share.types import AgentKind
@@ -102,19 +103,18 @@ class RoomBudget:
         return agent.keyframe_s / (1 + agent.keyframe_s * keyframes_hz)
 
     @property
-    def longest_air_s(self) -> float | None:
-        """T of the agent whose keyframes take longest, s; None without an agent."""
-        return max(map(self.air_s, self.agents.values()), default=None)
+    def usual_air_s(self) -> float | None:
+        """T in the median of all agents, s: that of one is noisy. None without an agent."""
+        return median(map(self.air_s, self.agents.values())) if self.agents else None
 
-    @property
-    def is_short(self) -> bool:
-        """Whether not everyone can send what it wants without anyone noticing."""
+    def is_short(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
+        """Whether not everyone can send what it wants with less than `noticed_ms` on the air."""
         wanted = {name: agent.wanted_hz for name, agent in self.agents.items()}
-        return _Prediction(self, is_thinned=False).is_noticed(wanted)
+        return _Prediction(self, is_thinned=False).is_noticed(wanted, noticed_ms)
 
-    def allocate(self) -> dict[str, RateGrant]:
+    def allocate(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
         """Return what every agent may send where the air is short."""
-        rates = _Prediction(self, is_thinned=True).allocate()
+        rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
@@ -143,12 +143,13 @@ class _Prediction:
         load = self._pose_load + sum(hz * self._air_s[name] for name, hz in rates.items())
         return min(load, MAX_LOAD)
 
-    def is_noticed(self, rates: Mapping[str, float]) -> bool:
-        """Return whether a keyframe of any agent would take longer on the air than a wearer notices."""
-        return max(self._air_s.values()) / (1 - self.load(rates)) > ACCEPTED_DELAY_MS / 1e3
+    def is_noticed(self, rates: Mapping[str, float], noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
+        """Return whether keyframes would take longer on the air than a wearer notices."""
+        return median(self._air_s.values()) / (1 - self.load(rates)) > noticed_ms / 1e3
 
-    def allocate(self) -> dict[str, float]:
-        """Return the rates, Hz: least ones, then steps to whom they gain most."""
+    def allocate(self, noticed_ms: float) -> dict[str, float]:
+        """Return the rates, Hz: least ones, then steps to whom they gain most; while nobody notices, those of
+        who comes first before those of others."""
         rates = {name: agent.least_hz for name, agent in self._agents.items()}
         while True:
             load = self.load(rates)
@@ -158,16 +159,17 @@ class _Prediction:
                 for name, hz in rates.items()
                 if hz + _STEP_HZ <= self._agents[name].wanted_hz
             }
-            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n)}
-            worth = {n: gain for n, gain in gains.items() if gain > _STEP_HZ * cost and self._comes_first(n)}
-            steps = free or worth
+            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n, noticed_ms)}
+            first = {n: gain for n, gain in gains.items() if self._comes_first(n)}
+            worth = {n: gain for n, gain in first.items() if gain > _STEP_HZ * cost}
+            steps = {n: gain for n, gain in free.items() if n in first} or free or worth
             if not steps or load >= MAX_LOAD:
                 return rates
             best = max(steps, key=lambda name: steps[name])
             rates = {**rates, best: rates[best] + _STEP_HZ}
 
-    def _is_step_noticed(self, rates: Mapping[str, float], name: str) -> bool:
-        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ})
+    def _is_step_noticed(self, rates: Mapping[str, float], name: str, noticed_ms: float) -> bool:
+        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ}, noticed_ms)
 
     def _comes_first(self, name: str) -> bool:
         """Return whether others may be delayed for an agent: for headsets, and among robots alone."""
