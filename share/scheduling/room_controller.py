@@ -26,6 +26,7 @@ class RoomController:
     def __init__(self) -> None:
         self._budget = RoomBudget()
         self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
+        self._last: dict[str, AgentAir] = {}  # newest report of each, of the silent too
         self._grants: dict[str, RateGrant] = {}
         self._allocated_ns, self._is_short = 0, False
         self._cut: dict[str, tuple[float, int]] = {}  # rates that were cut, and since when they may rise
@@ -71,7 +72,8 @@ class RoomController:
             updated_ns=now_ns,
             is_placed=is_placed,
         )
-        self._budget = self._budget.with_report(name, reported)
+        self._budget = self._budget.with_report(name, reported, self._last.get(name))
+        self._last[name] = self._budget.agents[name]
         self._look_at_capacity(now_ns)
         if counts[0] < _SLOW_START_KEYFRAMES:
             return self.first_grant(terms.form, now_ns)
@@ -128,7 +130,7 @@ class RoomController:
     def forget(self, name: str) -> None:
         """Drop an agent."""
         self._budget = self._budget.without(name)
-        for kept in (self._counts, self._grants, self._starting, self._cut):
+        for kept in (self._counts, self._last, self._grants, self._starting, self._cut):
             kept.pop(name, None)
 
     def _rates(self, name: str, counts: tuple[int, int], now_ns: int) -> tuple[float, float]:
