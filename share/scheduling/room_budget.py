@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from statistics import median
 
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
 from share.types import AgentKind
@@ -29,7 +30,9 @@ FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
 MAX_LOAD = 0.95  # beyond, the formula has no meaning
 _STEP_HZ = 0.25
-_TIME_CONSTANT_S = 2.0  # of measured times and rates
+_TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
+_MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
+_LEAST_AIR_S = 1e-4
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
@@ -75,18 +78,19 @@ class RoomBudget:
 
     agents: Mapping[str, AgentAir] = field(default_factory=dict)
 
-    def with_report(self, name: str, reported: AgentAir) -> RoomBudget:
+    def with_report(self, name: str, reported: AgentAir, before: AgentAir | None = None) -> RoomBudget:
         """Return the budget after an agent's report, whose keyframe_s, hz and pose_hz are filtered here.
-        Agents that are silent are dropped."""
-        now_ns, before = reported.updated_ns, self.agents.get(name)
+        Agents that are silent are dropped. before: what was known of this one before it fell silent."""
+        now_ns, before = reported.updated_ns, self.agents.get(name, before)
         if before is not None:
             elapsed_s = max(0.0, (now_ns - before.updated_ns) / 1e9)
             weight = -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
             reported = replace(
                 reported,
+                keyframe_s=_filtered_time(before.keyframe_s, reported.keyframe_s, weight),
                 **{
                     key: getattr(before, key) + weight * (getattr(reported, key) - getattr(before, key))
-                    for key in ("keyframe_s", "hz", "pose_hz")
+                    for key in ("hz", "pose_hz")
                 },
             )
         present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < SILENT_S * 1e9}
@@ -102,20 +106,26 @@ class RoomBudget:
         return agent.keyframe_s / (1 + agent.keyframe_s * keyframes_hz)
 
     @property
-    def longest_air_s(self) -> float | None:
-        """T of the agent whose keyframes take longest, s; None without an agent."""
-        return max(map(self.air_s, self.agents.values()), default=None)
+    def usual_air_s(self) -> float | None:
+        """T in the median of all agents, s: that of one is noisy. None without an agent."""
+        return median(map(self.air_s, self.agents.values())) if self.agents else None
 
-    @property
-    def is_short(self) -> bool:
-        """Whether not everyone can send what it wants without anyone noticing."""
+    def is_short(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
+        """Whether not everyone can send what it wants with less than `noticed_ms` on the air."""
         wanted = {name: agent.wanted_hz for name, agent in self.agents.items()}
-        return _Prediction(self, is_thinned=False).is_noticed(wanted)
+        return _Prediction(self, is_thinned=False).is_noticed(wanted, noticed_ms)
 
-    def allocate(self) -> dict[str, RateGrant]:
+    def allocate(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
         """Return what every agent may send where the air is short."""
-        rates = _Prediction(self, is_thinned=True).allocate()
+        rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
+
+
+def _filtered_time(before_s: float, reported_s: float, weight: float) -> float:
+    """Return the average of logarithms: a keyframe that waited for a pause of the edge counts little."""
+    before_s, reported_s = max(before_s, _LEAST_AIR_S), max(reported_s, _LEAST_AIR_S)
+    reported_s = min(reported_s, before_s * _MOST_RISE)
+    return before_s * math.exp(weight * math.log(reported_s / before_s))
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
@@ -143,12 +153,13 @@ class _Prediction:
         load = self._pose_load + sum(hz * self._air_s[name] for name, hz in rates.items())
         return min(load, MAX_LOAD)
 
-    def is_noticed(self, rates: Mapping[str, float]) -> bool:
-        """Return whether a keyframe of any agent would take longer on the air than a wearer notices."""
-        return max(self._air_s.values()) / (1 - self.load(rates)) > ACCEPTED_DELAY_MS / 1e3
+    def is_noticed(self, rates: Mapping[str, float], noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
+        """Return whether keyframes would take longer on the air than a wearer notices."""
+        return median(self._air_s.values()) / (1 - self.load(rates)) > noticed_ms / 1e3
 
-    def allocate(self) -> dict[str, float]:
-        """Return the rates, Hz: least ones, then steps to whom they gain most."""
+    def allocate(self, noticed_ms: float) -> dict[str, float]:
+        """Return the rates, Hz: least ones, then steps to whom they gain most; while nobody notices, those of
+        who comes first before those of others."""
         rates = {name: agent.least_hz for name, agent in self._agents.items()}
         while True:
             load = self.load(rates)
@@ -158,16 +169,17 @@ class _Prediction:
                 for name, hz in rates.items()
                 if hz + _STEP_HZ <= self._agents[name].wanted_hz
             }
-            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n)}
-            worth = {n: gain for n, gain in gains.items() if gain > _STEP_HZ * cost and self._comes_first(n)}
-            steps = free or worth
+            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n, noticed_ms)}
+            first = {n: gain for n, gain in gains.items() if self._comes_first(n)}
+            worth = {n: gain for n, gain in first.items() if gain > _STEP_HZ * cost}
+            steps = {n: gain for n, gain in free.items() if n in first} or free or worth
             if not steps or load >= MAX_LOAD:
                 return rates
             best = max(steps, key=lambda name: steps[name])
             rates = {**rates, best: rates[best] + _STEP_HZ}
 
-    def _is_step_noticed(self, rates: Mapping[str, float], name: str) -> bool:
-        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ})
+    def _is_step_noticed(self, rates: Mapping[str, float], name: str, noticed_ms: float) -> bool:
+        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ}, noticed_ms)
 
     def _comes_first(self, name: str) -> bool:
         """Return whether others may be delayed for an agent: for headsets, and among robots alone."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from share.scheduling.qoe import QoeParameters
+from dataclasses import replace
+
+from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters
 from share.scheduling.room_budget import SILENT_S, AgentAir, RateGrant, RoomBudget, first_grant
 from share.scheduling.room_capacity import RoomCapacity
 from share.scheduling.staggered_start import UNKNOWN_KEYFRAME_S, StaggeredStart
@@ -14,6 +16,8 @@ _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 _STARTING_NS = 10_000_000_000  # who has not sent them by then takes no part from others
 _STARTING_LOAD = 0.5  # of the air, for all that begin
+_PLENTY = 0.75  # of what is noticed: less, and the air is no longer short
+_STEP_HZ = 0.25  # by which a rate that was cut rises in each period
 
 
 class RoomController:
@@ -22,8 +26,10 @@ class RoomController:
     def __init__(self) -> None:
         self._budget = RoomBudget()
         self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
+        self._last: dict[str, AgentAir] = {}  # newest report of each, of the silent too
         self._grants: dict[str, RateGrant] = {}
-        self._allocated_ns = 0
+        self._allocated_ns, self._is_short = 0, False
+        self._cut: dict[str, tuple[float, int]] = {}  # rates that were cut, and since when they may rise
         self._start = StaggeredStart()
         self._starting: dict[str, int] = {}  # agents whose air is not known, and when they joined
         self._capacity, self._looked_ns = RoomCapacity(), 0
@@ -31,14 +37,14 @@ class RoomController:
     def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
         """Return what an agent may send whose air is not known: its part of what all that begin have."""
         self._starting = {n: at for n, at in self._starting.items() if now_ns - at < _STARTING_NS}
-        air_s = self._budget.longest_air_s or UNKNOWN_KEYFRAME_S
+        air_s = self._budget.usual_air_s or UNKNOWN_KEYFRAME_S
         hz = _STARTING_LOAD / (air_s * max(1, len(self._starting)))
         return first_grant(form, hz)
 
     def hold_ms(self, name: str, now_ns: int) -> float:
         """Return how long an agent that joins now holds its keyframes, ms."""
         self._starting[name] = now_ns
-        return self._start.hold_ms(self._budget.longest_air_s, now_ns)
+        return self._start.hold_ms(self._budget.usual_air_s, now_ns)
 
     def grant(
         self,
@@ -66,17 +72,44 @@ class RoomController:
             updated_ns=now_ns,
             is_placed=is_placed,
         )
-        self._budget = self._budget.with_report(name, reported)
+        self._budget = self._budget.with_report(name, reported, self._last.get(name))
+        self._last[name] = self._budget.agents[name]
         self._look_at_capacity(now_ns)
         if counts[0] < _SLOW_START_KEYFRAMES:
             return self.first_grant(terms.form, now_ns)
         self._starting.pop(name, None)
-        if not self._budget.is_short:
-            self._grants = {}
-            return RateGrant(wanted_hz)
-        if name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
-            self._grants, self._allocated_ns = self._budget.allocate(), now_ns
-        return self._grants[name]
+        if not self._is_short or name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
+            self._allocate(now_ns)
+        return self._risen(name, self._grants[name], now_ns)
+
+    def _allocate(self, now_ns: int) -> None:
+        """Allot the air anew. What it takes a little more or less changes nothing: once the air is short it
+        counts as such until there is plenty, and a rate stands as long as it is not too much and there is no
+        plenty for more."""
+        self._allocated_ns, plenty_ms = now_ns, _PLENTY * ACCEPTED_DELAY_MS
+        self._is_short = self._budget.is_short(plenty_ms if self._is_short else ACCEPTED_DELAY_MS)
+        if not self._is_short:
+            self._grants = {n: RateGrant(agent.wanted_hz) for n, agent in self._budget.agents.items()}
+            return
+        most, least, before = self._budget.allocate(), self._budget.allocate(plenty_ms), self._grants
+        self._grants = {
+            name: replace(grant, hz=min(grant.hz, max(least[name].hz, before.get(name, grant).hz)))
+            for name, grant in most.items()
+        }
+
+    def _risen(self, name: str, grant: RateGrant, now_ns: int) -> RateGrant:
+        """Return the grant, of which a rate that was cut rises slowly: others rise as well."""
+        if self._is_short and name not in self._cut:
+            self._cut[name] = grant.hz, now_ns
+        if (cut := self._cut.get(name)) is None:
+            return grant
+        before_hz, since_ns = cut
+        hz = min(grant.hz, before_hz + _STEP_HZ * int((now_ns - since_ns) / _PERIOD_NS))
+        if hz != before_hz or hz >= grant.hz:
+            self._cut[name] = hz, now_ns
+        if not self._is_short and hz >= grant.hz:
+            del self._cut[name]
+        return replace(grant, hz=hz)
 
     def objection(self, form: AgentKind, now_ns: int) -> str | None:
         """Return why the room cannot serve one more agent of a form, for a person; None if it can."""
@@ -97,7 +130,7 @@ class RoomController:
     def forget(self, name: str) -> None:
         """Drop an agent."""
         self._budget = self._budget.without(name)
-        for kept in (self._counts, self._grants, self._starting):
+        for kept in (self._counts, self._last, self._grants, self._starting, self._cut):
             kept.pop(name, None)
 
     def _rates(self, name: str, counts: tuple[int, int], now_ns: int) -> tuple[float, float]:

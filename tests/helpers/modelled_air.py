@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
 from share.scheduling.room_budget import first_grant
@@ -15,10 +17,19 @@ TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in Agen
 
 
 class Air:
-    """A channel on which a keyframe alone takes `alone_ms`. history: rates of all agents every 0.5 s."""
+    """A channel on which a keyframe alone takes `alone_ms`. noise: of what each measures, sigma of its
+    logarithm. robots_hz: what robots want. history: rates of all agents every 0.5 s."""
 
-    def __init__(self, alone_ms: float, kinds: tuple[AgentKind, ...], wanted_hz: float = 1.5) -> None:
-        self.alone_ms, self.wanted_hz = alone_ms, wanted_hz
+    def __init__(
+        self,
+        alone_ms: float,
+        kinds: tuple[AgentKind, ...],
+        wanted_hz: float = 1.5,
+        robots_hz: float | None = None,
+        noise: float = 0.0,
+    ) -> None:
+        self.alone_ms, self._noise, self._rng = alone_ms, noise, np.random.default_rng(1)
+        self.wanted_hz = {AgentKind.AR: wanted_hz, AgentKind.ROBOT: robots_hz or wanted_hz}
         self.room, self.now_s = RoomController(), 0.0
         self.kinds: list[AgentKind] = []
         self.counts: list[list[float]] = []
@@ -56,7 +67,8 @@ class Air:
             if sent_s is None:  # during a pause nothing arrives
                 self.counts[k][0] += STEP_S * sent
                 self.counts[k][1] += STEP_S * (30.0 if pose_hz is None else pose_hz)
-            told = Evaluation(0, 60 + keyframe_ms, 1.2, 10.0, 5.0, 5 + keyframe_ms, 0.5)
+            air_ms = keyframe_ms * float(np.exp(self._noise * self._rng.standard_normal()))
+            told = Evaluation(0, 60 + air_ms, 1.2, 10.0, 5.0, 5 + air_ms, 0.5)
             counts = round(self.counts[k][0]), round(self.counts[k][1])
-            at = f"a{k}", TERMS[kind], self.wanted_hz, told, keyframe_ms, counts, round(self.now_s * S)
+            at = f"a{k}", TERMS[kind], self.wanted_hz[kind], told, air_ms, counts, round(self.now_s * S)
             self.grants[k] = self.room.grant(*at)

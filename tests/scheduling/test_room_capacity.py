@@ -60,6 +60,15 @@ def test_a_room_full_of_headsets_says_so() -> None:
     assert "seconds" in str(settled(room(60, 0)).objection(AR, 10 * S))
 
 
+@pytest.mark.parametrize("honest", [1, 2, 6])
+def test_an_agent_that_reports_bad_air_shuts_nobody_out(honest: int) -> None:
+    liar = room(1, 0, keyframe_ms=9000.0).agents["ar0"]
+    budget = RoomBudget({**room(honest, 1).agents, "liar": liar})
+    capacity = settled(budget)
+    assert [capacity.objection(kind, 10 * S) for kind in AgentKind] == [None, None]
+    assert capacity.displaced(AR, 10 * S) == ()
+
+
 def test_a_short_pause_refuses_nobody() -> None:
     full, free = room(23, 0), room(8, 4)
     capacity = RoomCapacity().looked_at(full, 0)
