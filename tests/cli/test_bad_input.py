@@ -591,7 +591,7 @@ def _not_late(said: str) -> list[str]:
 def test_agent_fails_if_no_edge_answers(room, share, tmp_path):
     """Tracking is what `share track` makes of it, to the last digit; everything is written."""
     config = tmp_path / "quick.yaml"
-    config.write_text("link: {silent_s: 0.4}\nagent: {finish_s: 0.2}")
+    config.write_text("link: {silent_s: 0.4}\nagent: {finish_s: 0.2, late_ms: 0}")
     done = share(*as_agent(room / "ar1", tmp_path / "out"), "--config", config, *FEW)
     assert done.code == 1
     report = json.loads((tmp_path / "out" / "report.json").read_text())
