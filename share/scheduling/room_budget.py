@@ -36,7 +36,7 @@ MAX_LOAD = 0.95  # beyond, the formula has no meaning
 _STEP_HZ = 0.25
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
-_LEAST_AIR_S = 1e-4
+_LEAST_AIR_S = 1e-3
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
@@ -89,12 +89,13 @@ class RoomBudget:
         if before is not None:
             elapsed_s = max(0.0, (now_ns - before.updated_ns) / 1e9)
             weight = -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
+            most_s = _MOST_RISE * max(before.keyframe_s, _LEAST_AIR_S)
+            reported = replace(reported, keyframe_s=min(reported.keyframe_s, most_s))
             reported = replace(
                 reported,
-                keyframe_s=_filtered_time(before.keyframe_s, reported.keyframe_s, weight),
                 **{
                     key: getattr(before, key) + weight * (getattr(reported, key) - getattr(before, key))
-                    for key in ("hz", "pose_hz")
+                    for key in ("keyframe_s", "hz", "pose_hz")
                 },
             )
         present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < SILENT_S * 1e9}
@@ -128,13 +129,6 @@ class RoomBudget:
         """Return what every agent may send where the air is short."""
         rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
-
-
-def _filtered_time(before_s: float, reported_s: float, weight: float) -> float:
-    """Return the average of logarithms: a keyframe that waited for a pause of the edge counts little."""
-    before_s, reported_s = max(before_s, _LEAST_AIR_S), max(reported_s, _LEAST_AIR_S)
-    reported_s = min(reported_s, before_s * _MOST_RISE)
-    return before_s * math.exp(weight * math.log(reported_s / before_s))
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:

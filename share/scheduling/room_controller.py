@@ -72,11 +72,13 @@ class RoomController:
             updated_ns=now_ns,
             is_placed=is_placed,
         )
-        if counts[0] < _SLOW_START_KEYFRAMES:  # no keyframe bears out what it reports
+        if not counts[0]:  # no keyframe bears out what it reports
             return self.first_grant(terms.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]
         self._look_at_capacity(now_ns)
+        if counts[0] < _SLOW_START_KEYFRAMES:
+            return self.first_grant(terms.form, now_ns)
         self._starting.pop(name, None)
         if not self._is_short or name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
             self._allocate(now_ns)

@@ -121,7 +121,7 @@ def test_agents_that_are_silent_or_have_left_take_no_air() -> None:
 def test_measurements_are_filtered() -> None:
     before = agent(keyframe_ms=40.0)
     after = RoomBudget({"a0": before}).with_report("a0", agent(keyframe_ms=400.0, updated_ns=S // 2))
-    assert 0.04 < after.agents["a0"].keyframe_s < 0.05  # of ten times as long one counts little
+    assert 0.04 < after.agents["a0"].keyframe_s < 0.06  # of ten times as long one counts little
     later = after
     for second in range(1, 21):
         later = later.with_report("a0", agent(keyframe_ms=120.0, updated_ns=second * S))
