@@ -193,6 +193,7 @@ class SharePolicy(Policy):
         super().__init__(config)
         self._states: dict[str, PidState] = {}
         self._base_delays: dict[str, BaseDelay] = {}
+        self._base_trips: dict[str, BaseDelay] = {}
         self._room = RoomController()
 
     def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
@@ -212,7 +213,10 @@ class SharePolicy(Policy):
         evaluation = report.evaluation
         hz = self.rate(agent, report.kind, evaluation.delay_ms, evaluation.error_cm, report.now_ns)
         terms = self._qoe_parameters(agent, report.kind)
-        air_ms = max(0.0, evaluation.ack_ms - evaluation.rtt_ms - report.held_ms)
+        # a ping waits for the air as well: of the round trip only what is there without others is not air
+        trip = self._base_trips.get(agent, BaseDelay()).with_delay(evaluation.rtt_ms, report.now_ns)
+        self._base_trips[agent] = trip
+        air_ms = max(0.0, evaluation.ack_ms - trip.ms - report.held_ms)
         counts = report.keyframes, report.poses
         return self._room.grant(agent, terms, hz, evaluation, air_ms, counts, report.now_ns, report.is_placed)
 
@@ -233,6 +237,7 @@ class SharePolicy(Policy):
     def forget(self, agent: str) -> None:
         self._states.pop(agent, None)
         self._base_delays.pop(agent, None)
+        self._base_trips.pop(agent, None)
         self._room.forget(agent)
 
     def _avoidable_delay_ms(self, agent: str, delay_ms: float, now_ns: int) -> float:

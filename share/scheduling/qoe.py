@@ -7,11 +7,15 @@ IMWUT 10(3) 97, 2026; the defaults and their reasons: docs/understand/scheduling
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from share.config import AgentQoe, ControlConfig
-from share.types import AgentKind
+from share.types import F64, AgentKind
 
 ACCEPTED_DELAY_MS = 20.0  # d0: a headset wearer does not notice less
 REFERENCE_ACCURACY = 1.0  # a0, 1/cm
@@ -87,3 +91,34 @@ def qoe_factors(delay_ms: float, error_cm: float | None, parameters: QoeParamete
         if parameters.form is AgentKind.AR
         else QoeFactors(quality_factor, penalty_factor)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class QoeTable:
+    """QoE parameters of N agents, as in `QoeParameters`."""
+
+    is_ar: NDArray[np.bool_]
+    beta: F64
+    gamma: F64
+    theta_ms: F64
+    lowest_penalty: F64
+
+    @classmethod
+    def of(cls, parameters: Sequence[QoeParameters]) -> QoeTable:
+        return cls(
+            np.array([one.form is AgentKind.AR for one in parameters], bool),
+            np.array([one.beta for one in parameters]),
+            np.array([one.gamma for one in parameters]),
+            np.array([one.theta_ms for one in parameters]),
+            np.array([-np.inf if one.signed else 0.0 for one in parameters]),
+        )
+
+    def qoe(self, delay_ms: F64, error_cm: F64) -> F64:
+        """Return `qoe` of each agent (N,). error_cm NaN: unknown."""
+        accuracy = 1.0 / np.maximum(error_cm, MIN_ERROR_CM)
+        accuracy = np.where(np.isnan(accuracy), REFERENCE_ACCURACY, accuracy)
+        penalty = np.where(self.is_ar, delay_ms - ACCEPTED_DELAY_MS, REFERENCE_ACCURACY - accuracy)
+        quality = np.where(self.is_ar, accuracy, 1.0 / (delay_ms + self.theta_ms))
+        exponent = -self.beta * np.maximum(penalty, self.lowest_penalty)
+        out: F64 = np.exp(np.minimum(exponent, _MAX_EXPONENT)) * -np.expm1(-self.gamma * quality)
+        return out

@@ -15,10 +15,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from statistics import median
 
-from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe
-from share.types import AgentKind
+import numpy as np
+from numpy.typing import NDArray
+
+from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, QoeTable
+from share.types import F64, AgentKind
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
 JOINING_HZ = 1.0  # of who shares a map with nobody yet
@@ -32,7 +36,7 @@ MAX_LOAD = 0.95  # beyond, the formula has no meaning
 _STEP_HZ = 0.25
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
-_LEAST_AIR_S = 1e-4
+_LEAST_AIR_S = 1e-3
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
@@ -85,12 +89,13 @@ class RoomBudget:
         if before is not None:
             elapsed_s = max(0.0, (now_ns - before.updated_ns) / 1e9)
             weight = -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
+            most_s = _MOST_RISE * max(before.keyframe_s, _LEAST_AIR_S)
+            reported = replace(reported, keyframe_s=min(reported.keyframe_s, most_s))
             reported = replace(
                 reported,
-                keyframe_s=_filtered_time(before.keyframe_s, reported.keyframe_s, weight),
                 **{
                     key: getattr(before, key) + weight * (getattr(reported, key) - getattr(before, key))
-                    for key in ("hz", "pose_hz")
+                    for key in ("keyframe_s", "hz", "pose_hz")
                 },
             )
         present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < SILENT_S * 1e9}
@@ -102,30 +107,28 @@ class RoomBudget:
 
     def air_s(self, agent: AgentAir) -> float:
         """Return T of an agent, s."""
-        keyframes_hz = sum(a.hz + POSE_COST * a.pose_hz for a in self.agents.values())
-        return agent.keyframe_s / (1 + agent.keyframe_s * keyframes_hz)
+        return agent.keyframe_s / (1 + agent.keyframe_s * self._keyframes_hz)
+
+    @cached_property
+    def _keyframes_hz(self) -> float:
+        """L, with poses as the keyframes whose air they take."""
+        return sum(a.hz + POSE_COST * a.pose_hz for a in self.agents.values())
 
     @property
     def usual_air_s(self) -> float | None:
-        """T in the median of all agents, s: that of one is noisy. None without an agent."""
-        return median(map(self.air_s, self.agents.values())) if self.agents else None
+        """T in the median of all agents, s: that of one is noisy, or false; of two the lesser. None without
+        an agent."""
+        times = [self.air_s(agent) for agent in self.agents.values()]
+        return None if not times else median(times) if len(times) > 2 else min(times)
 
     def is_short(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
         """Whether not everyone can send what it wants with less than `noticed_ms` on the air."""
-        wanted = {name: agent.wanted_hz for name, agent in self.agents.items()}
-        return _Prediction(self, is_thinned=False).is_noticed(wanted, noticed_ms)
+        return _Prediction(self, is_thinned=False).is_noticed(noticed_ms)
 
     def allocate(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
         """Return what every agent may send where the air is short."""
         rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
-
-
-def _filtered_time(before_s: float, reported_s: float, weight: float) -> float:
-    """Return the average of logarithms: a keyframe that waited for a pause of the edge counts little."""
-    before_s, reported_s = max(before_s, _LEAST_AIR_S), max(reported_s, _LEAST_AIR_S)
-    reported_s = min(reported_s, before_s * _MOST_RISE)
-    return before_s * math.exp(weight * math.log(reported_s / before_s))
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
@@ -139,76 +142,69 @@ def scarce_grant(form: AgentKind, hz: float) -> RateGrant:
 
 
 class _Prediction:
-    """Predicts the QoE of all agents by their rates. is_thinned: with fewer poses."""
+    """Predicts the QoE of all agents by their rates (N,), in the budget's order. is_thinned: with fewer
+    poses."""
 
     def __init__(self, budget: RoomBudget, is_thinned: bool) -> None:
-        self._agents = budget.agents
-        self._air_s = {name: budget.air_s(agent) for name, agent in self._agents.items()}
-        self._pose_load = 0.0
-        for name, agent in self._agents.items():
-            pose_hz = SCARCE_POSE_HZ[agent.terms.form] if is_thinned else FULL_POSE_HZ
-            self._pose_load += POSE_COST * pose_hz * self._air_s[name]
+        agents = list(budget.agents.values())
+        self._names = list(budget.agents)
+        self._air_s = np.array([budget.air_s(agent) for agent in agents])
+        self._usual_air_s = budget.usual_air_s or 0.0
+        forms = [agent.terms.form for agent in agents]
+        pose_hz = np.array([SCARCE_POSE_HZ[form] if is_thinned else FULL_POSE_HZ for form in forms])
+        self._pose_load = POSE_COST * float(pose_hz @ self._air_s)
+        self._weight = np.array([_WEIGHT[form] for form in forms])
+        is_headset = np.array([form is AgentKind.AR for form in forms])
+        self._comes_first = is_headset | ~is_headset.any()  # others may be delayed for it
+        self._least_hz = np.array([agent.least_hz for agent in agents])
+        self._wanted_hz = np.array([agent.wanted_hz for agent in agents])
+        self._elsewhere_ms = np.array([agent.elsewhere_ms for agent in agents])
+        self._terms = QoeTable.of([agent.terms for agent in agents])
+        self._error_cm = np.array([math.nan if a.error_cm is None else a.error_cm for a in agents])
+        self._drift_cm = np.minimum([agent.drift_cm for agent in agents], self._error_cm)
+        self._measured_hz = np.maximum([agent.hz for agent in agents], 1e-3)
 
-    def load(self, rates: Mapping[str, float]) -> float:
-        load = self._pose_load + sum(hz * self._air_s[name] for name, hz in rates.items())
-        return min(load, MAX_LOAD)
-
-    def is_noticed(self, rates: Mapping[str, float], noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
-        """Return whether keyframes would take longer on the air than a wearer notices."""
-        return median(self._air_s.values()) / (1 - self.load(rates)) > noticed_ms / 1e3
+    def is_noticed(self, noticed_ms: float) -> bool:
+        """Return whether keyframes at the wanted rates take longer on the air than a wearer notices."""
+        return bool(self._is_noticed(self._load(self._wanted_hz), noticed_ms))
 
     def allocate(self, noticed_ms: float) -> dict[str, float]:
         """Return the rates, Hz: least ones, then steps to whom they gain most; while nobody notices, those of
         who comes first before those of others."""
-        rates = {name: agent.least_hz for name, agent in self._agents.items()}
-        while True:
-            load = self.load(rates)
-            cost = self._cost(rates, load)
-            gains = {
-                name: self._gain(name, hz, load) / max(self._air_s[name], 1e-6)
-                for name, hz in rates.items()
-                if hz + _STEP_HZ <= self._agents[name].wanted_hz
-            }
-            free = {n: gain for n, gain in gains.items() if not self._is_step_noticed(rates, n, noticed_ms)}
-            first = {n: gain for n, gain in gains.items() if self._comes_first(n)}
-            worth = {n: gain for n, gain in first.items() if gain > _STEP_HZ * cost}
-            steps = {n: gain for n, gain in free.items() if n in first} or free or worth
-            if not steps or load >= MAX_LOAD:
-                return rates
-            best = max(steps, key=lambda name: steps[name])
-            rates = {**rates, best: rates[best] + _STEP_HZ}
+        hz = self._least_hz.copy()
+        while len(hz) and (load := self._load(hz)) < MAX_LOAD:
+            is_open = hz + _STEP_HZ <= self._wanted_hz
+            gain = self._gain(hz, load) / np.maximum(self._air_s, 1e-6)
+            is_free = is_open & ~self._is_noticed(self._capped(load + _STEP_HZ * self._air_s), noticed_ms)
+            steps = is_free & self._comes_first
+            if not steps.any():
+                steps = is_free
+            if not steps.any():
+                steps = is_open & self._comes_first & (gain > _STEP_HZ * self._cost(hz, load))
+            if not steps.any():
+                break
+            hz[np.argmax(np.where(steps, gain, -np.inf))] += _STEP_HZ
+        return dict(zip(self._names, hz.tolist(), strict=True))
 
-    def _is_step_noticed(self, rates: Mapping[str, float], name: str, noticed_ms: float) -> bool:
-        return self.is_noticed({**rates, name: rates[name] + _STEP_HZ}, noticed_ms)
+    def _load(self, hz: F64) -> float:
+        return float(self._capped(self._pose_load + hz @ self._air_s))
 
-    def _comes_first(self, name: str) -> bool:
-        """Return whether others may be delayed for an agent: for headsets, and among robots alone."""
-        form = self._agents[name].terms.form
-        return form is AgentKind.AR or all(agent.terms.form is form for agent in self._agents.values())
+    def _capped(self, load: F64 | float) -> F64:
+        return np.minimum(load, MAX_LOAD)
 
-    def _gain(self, name: str, hz: float, load: float) -> float:
-        """Return what a step of its rate gains an agent, weighted, at the same load."""
-        more, now = (self._qoe(name, rate, load) for rate in (hz + _STEP_HZ, hz))
-        return _WEIGHT[self._agents[name].terms.form] * (more - now)
+    def _is_noticed(self, load: F64 | float, noticed_ms: float) -> NDArray[np.bool_]:
+        return np.asarray(self._usual_air_s / (1 - np.asarray(load)) > noticed_ms / 1e3)
 
-    def _cost(self, rates: Mapping[str, float], load: float) -> float:
+    def _gain(self, hz: F64, load: float) -> F64:
+        """Return what a step of its rate gains each agent (N,), weighted, at the same load."""
+        return self._weight * (self._qoe(hz + _STEP_HZ, load) - self._qoe(hz, load))
+
+    def _cost(self, hz: F64, load: float) -> float:
         """Return the QoE, weighted, that all agents together lose by a load of one more."""
-        return (
-            sum(
-                _WEIGHT[agent.terms.form]
-                * (self._qoe(name, rates[name], load) - self._qoe(name, rates[name], load + _LOAD_STEP))
-                for name, agent in self._agents.items()
-            )
-            / _LOAD_STEP
-        )
+        return float(self._weight @ (self._qoe(hz, load) - self._qoe(hz, load + _LOAD_STEP))) / _LOAD_STEP
 
-    def _qoe(self, name: str, hz: float, load: float) -> float:
-        """Return the QoE of an agent, by its rate and the load of the air."""
-        agent = self._agents[name]
-        delay_ms = agent.elsewhere_ms + 1e3 * self._air_s[name] / (1 - load)
-        if agent.error_cm is None:
-            return qoe(delay_ms, None, agent.terms)
-        drift = min(agent.drift_cm, agent.error_cm)
-        drift_square = drift**2 * max(agent.hz, 1e-3) / max(hz, 1e-3)  # a random walk between keyframes
-        error_cm = math.sqrt(agent.error_cm**2 - drift**2 + drift_square)
-        return qoe(delay_ms, error_cm, agent.terms)
+    def _qoe(self, hz: F64, load: float) -> F64:
+        """Return the QoE of each agent (N,), by its rate and the load of the air."""
+        delay_ms = self._elsewhere_ms + 1e3 * self._air_s / (1 - load)
+        growth = self._measured_hz / np.maximum(hz, 1e-3) - 1  # a random walk between keyframes
+        return self._terms.qoe(delay_ms, np.sqrt(self._error_cm**2 + self._drift_cm**2 * growth))

@@ -72,6 +72,8 @@ class RoomController:
             updated_ns=now_ns,
             is_placed=is_placed,
         )
+        if not counts[0]:  # no keyframe bears out what it reports
+            return self.first_grant(terms.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]
         self._look_at_capacity(now_ns)

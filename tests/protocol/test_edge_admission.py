@@ -303,6 +303,8 @@ def evaluated(edge, kinds, seconds=12):
     """Agents of these kinds that a keyframe takes 60 ms of air, of 120 ms in all; evaluated every second."""
     for k, kind in enumerate(kinds):
         tell(edge, k + 1, hello_of(f"a{k}", k + 1, kind=kind))
+        for number in range(2):
+            tell(edge, k + 1, keyframe(number))
     for second in range(1, seconds + 1):
         for k in range(len(kinds)):
             told = m.Evaluation(-1, 120.0, 1.0, track_ms=10.0, rtt_ms=5.0, ack_ms=65.0)
