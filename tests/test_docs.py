@@ -177,7 +177,7 @@ def test_the_site_lists_every_page() -> None:
 
 def test_every_picture_of_docs_is_shown_on_a_page() -> None:
     text = "".join(page.read_text() for page in PAGES)
-    pictures = [p for ext in ("jpg", "png", "svg") for p in DOCS.rglob(f"*.{ext}")]
+    pictures = [p for ext in ("jpg", "png", "svg", "webp") for p in DOCS.rglob(f"*.{ext}")]
     assert pictures and [p.name for p in pictures if p.name not in text] == []
 
 

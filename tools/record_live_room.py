@@ -1,10 +1,13 @@
-"""Record the live room while the demo's three agents play, as an animated WebP such as the one in README.
+"""Record the live room while two wearers and a robot play, as an animated WebP such as the one in README.
 
-    python tools/record_live_room.py --seconds 60 --out docs/pictures/live-room.webp
+    share emulate --scene warehouse --motion ar1=walk: --motion ar2=walk:speed=1.2 --motion robot=robot: \\
+        --profile d435i:640x480@15 --seconds 30 --seed 901 --out room
+    python tools/record_live_room.py --session room --seconds 30 --out docs/pictures/live-room.webp
 
-The session of `share demo` is played in virtual time (`share.lab.evaluate.simulation`), so that a slow
-browser changes nothing: between two pictures the room waits. A headless Chromium (`chromium` on the path,
-or CHROMIUM) draws the page. Needs the extras `emulate` and `view`, and Pillow.
+made that one; without --session it is the demo's. The session is played in virtual time
+(`share.lab.evaluate.simulation`), so that a slow browser changes nothing: between two pictures the room
+waits. A headless Chromium (`chromium` on the path, or CHROMIUM) draws the page. Needs the extras `emulate`
+and `view`, and Pillow.
 """
 
 from __future__ import annotations
@@ -157,7 +160,7 @@ def main() -> None:
     parser.add_argument("--scene", default="warehouse")
     parser.add_argument("--session", type=Path, help="in place of the demo's: a folder by `share emulate`")
     parser.add_argument("--hz", type=float, default=2.0, help="pictures a second")
-    parser.add_argument("--speed", type=float, default=2.0, help="how much faster it is shown")
+    parser.add_argument("--speed", type=float, default=1.0, help="how much faster it is shown")
     parser.add_argument("--size", default="1280x720", help="of the page")
     parser.add_argument("--width", type=int, default=960, help="of the animation")
     parser.add_argument("--out", type=Path, required=True)
