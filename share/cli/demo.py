@@ -229,7 +229,8 @@ def _renderable_scene(scene: str | None) -> str:
 
 
 def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool) -> str:
-    """since_s: when each agent came to share a map, s since the first one joined."""
+    """Return two tables, which an ordinary terminal is wide enough for: of errors and of times. since_s: when
+    each agent came to share a map, s since the first one joined."""
     joint = {} if result.joint is None else result.joint.agents
 
     def coverage(ates: Mapping[str, Ate | None]) -> Column:
@@ -242,13 +243,17 @@ def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool
     def count(name: str) -> Column:
         return name, lambda agent: str(result.agents[agent].report[name])
 
-    columns: tuple[Column, ...] = (
-        ("agent", str),
+    name: Column = ("agent", str)
+    errors: tuple[Column, ...] = (
+        name,
         ("odom ATE", lambda agent: _cm(result.agents[agent].odometry)),
         coverage({name: agent.odometry for name, agent in result.agents.items()}),
         ("in the map since", lambda agent: f"{since_s[agent]:.1f} s" if agent in since_s else "–"),
         ("map ATE", lambda agent: _cm(joint.get(agent))),
         coverage(joint),
+    )
+    times: tuple[Column, ...] = (
+        name,
         duration("pose p50", "track_ms", "p50"),
         duration("p95", "track_ms", "p95"),
         ("> 20 ms", lambda agent: f"{100 * result.agents[agent].report['over_20ms']:.1f} %"),
@@ -256,7 +261,7 @@ def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool
         duration("p95", "corrected_ms", "p95"),
         *(count(name) for name in ("keyframes", "sent", "corrections")),
     )
-    table = column_table(columns, result.agents)
+    table = "\n\n".join(column_table(columns, result.agents) for columns in (errors, times))
     if streamed:
         untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
         note = f"the edge tracked each agent alone; frames without an answer: {untracked}"

@@ -135,13 +135,18 @@ class _Acceptance:
 
     def play(self) -> list[CheckResult]:
         """Lead through the steps; return the findings."""
+        from share.cameras.live import LiveSource
         from share.config import Config
         from share.runtime.acceptance import AcceptanceRun, accept_device
         from share.runtime.signals import stop_on_signal
 
         source, sensor = self._source, self._camera.camera_request().profile
         run = AcceptanceRun(
-            self._seconds, self._line.print_line, lambda line: self._line.write(str(line)), source.stop
+            self._seconds,
+            self._line.print_line,
+            lambda line: self._line.write(str(line)),
+            source.stop,
+            source.feed.arrived_ns if isinstance(source, LiveSource) else None,
         )
         with stop_on_signal(source.stop):
             findings, self._figures = accept_device(source, Config(), sensor, run, self._tell)

@@ -177,7 +177,7 @@ def check_rates(found_hz: Mapping[str, float], stated_hz: Mapping[str, float]) -
 def check_losses(samples: int, missing: int, dropped: int) -> CheckResult:
     """missing: that the device numbered but did not deliver. dropped: that came too fast to be used."""
     share = (missing + dropped) / max(1, samples + missing)
-    what = f"{missing} missing, {dropped} dropped of {samples + missing} ({100 * share:.2g} %)"
+    what = f"{missing} missing, {dropped} dropped of {samples + missing} ({100 * share:.3g} %)"
     mend = (
         "missing: USB cable, port, usbfs_memory_mb (`share doctor`)",
         "dropped: this computer is too slow or busy: a lower --mode, or fewer programs",
@@ -214,7 +214,7 @@ def check_latency(p50_ms: float | None, p95_ms: float | None, over_20ms: float |
     """over_20ms: share of the frames whose pose came later than that."""
     if p50_ms is None or p95_ms is None or over_20ms is None:
         return fail("pose latency", "no frame came")
-    what = f"p50 {p50_ms:.1f} ms, p95 {p95_ms:.1f} ms, {100 * over_20ms:.2g} % over 20 ms"
+    what = f"p50 {p50_ms:.1f} ms, p95 {p95_ms:.1f} ms, {100 * over_20ms:.3g} % over 20 ms"
     if over_20ms <= _LATE_OK:
         return ok("pose latency", what)
     mend = "CPU governor, heat and other programs (`share doctor`); else a lower --mode"

@@ -17,6 +17,7 @@ from share.devices import acceptance as judge
 from share.devices import host as facts
 from share.devices.acceptance import BACK, LOOP, REST, STEPS, AcceptanceStep, HostSample, RestNoise
 from share.devices.checks import CheckResult
+from share.metrics.frame_log import latency
 from share.recordings.recording import Source
 from share.runtime.offline_tracking import OfflineFrame, track
 from share.sensors.measurement import CAM0, CAM1, IMU
@@ -29,6 +30,7 @@ _STANDING_S = 2.0  # whose mean position is that of the mark
 _HOST_PERIOD_S = 5.0
 _PATH_STEP_M = 0.05  # of the length of a path, so that noise adds nothing
 _SHOW_PERIOD_S = 1.0
+_LEAST_ARRIVALS = 100  # for the drift of the device's clock
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,10 @@ class _Pause:
 
 
 class AcceptanceRun:
-    """Collects what is measured. tell: is called with a line for the person. show: with the live line."""
+    """Collects what is measured. tell: is called with a line for the person. show: with the live line.
+
+    arrived_ns: returns when a live camera's image of a stamp arrived, monotonic; None of a recording.
+    """
 
     def __init__(
         self,
@@ -73,8 +78,10 @@ class AcceptanceRun:
         tell: Callable[[str], None],
         show: Callable[[AcceptanceLine], None] = lambda line: None,
         on_end: Callable[[], None] = lambda: None,
+        arrived_ns: Callable[[int], int] | None = None,
     ) -> None:
         self._seconds, self._tell, self._show, self._on_end = seconds, tell, show, on_end
+        self._arrived_ns = arrived_ns
         self._begin_ns: int | None = None
         self._step: AcceptanceStep | None = None
         self._frames, self._segment, self._shown_s = 0, -1, -_SHOW_PERIOD_S
@@ -84,7 +91,8 @@ class AcceptanceRun:
         self._pauses = {REST: _Pause(), BACK: _Pause()}
         self._path_m = 0.0
         self._path_end: F64 | None = None
-        self._arrivals: list[tuple[int, int]] = []  # stamp and this computer's clock, ns
+        self._arrivals: list[tuple[int, int]] = []  # stamp and arrival, ns
+        self._pose_ms: list[float] = []  # from arrival
         self.host: list[HostSample] = []
 
     # ------------------------------------------------------------------ while it runs
@@ -98,7 +106,8 @@ class AcceptanceRun:
         self._frames += 1
         self._segment += result.new_segment
         t_s = (frame.stamp_ns - self._begin_ns) * 1e-9
-        self._arrivals.append((frame.stamp_ns, time.monotonic_ns()))
+        if self._arrived_ns is not None:
+            self._add_arrival(step, self._arrived_ns(frame.stamp_ns))
         self._count_imu(frame.imu)
         part, left_s, done = self._step_at(t_s)
         self._enter(part)
@@ -113,6 +122,11 @@ class AcceptanceRun:
             self._show(AcceptanceLine(part.name, left_s, self._frames, str(result.state), 1e3 * step.track_s))
         if t_s >= self._seconds:
             self._on_end()
+
+    def _add_arrival(self, step: OfflineFrame, arrived_ns: int) -> None:
+        self._arrivals.append((step.frame.stamp_ns, arrived_ns))
+        after_pose_ms = 1e3 * (step.total_s - step.track_s)
+        self._pose_ms.append((time.monotonic_ns() - arrived_ns) * 1e-6 - after_pose_ms)
 
     def _step_at(self, t_s: float) -> tuple[AcceptanceStep, float, float]:
         """Return the step at a time, what is left of it, s, and the share of it that is done."""
@@ -162,14 +176,16 @@ class AcceptanceRun:
         start, end = (self._pauses[name] for name in (REST, BACK))
         a, b = start.mark(), end.mark()
         closing_m = None if a is None or b is None else float(np.linalg.norm(b - a))
-        track_ms = report["track_ms"]
+        pose = latency(self._pose_ms, []) if self._pose_ms else None
+        track_ms = report["track_ms"] if pose is None else pose.track_ms.report()
+        over_20ms = report["over_20ms"] if pose is None else pose.over_20ms
         return [
             *self._stream_findings(camera, profile),
             judge.check_rest(noise),
             *judge.check_noise(noise, profile.device.imu),
             judge.check_tracking(report["frames"], report["tracked"], report["lost_s"], report["init_s"]),
             judge.check_loop(self._path_m, closing_m, start.segment == end.segment),
-            judge.check_latency(track_ms["p50"], track_ms["p95"], report["over_20ms"]),
+            judge.check_latency(track_ms["p50"], track_ms["p95"], over_20ms),
             *judge.check_host(self.host, facts.core_count()),
         ]
 
@@ -203,10 +219,10 @@ class AcceptanceRun:
         """Return how much faster the device's clock is than this computer's: slope of the earliest arrivals.
 
         In each tenth of the time the least delay counts; those of the others are waiting."""
-        stamps, arrivals = (np.array(one, np.float64) for one in zip(*self._arrivals, strict=True))
-        delay, part = arrivals - stamps, (np.arange(len(stamps)) * 10 // len(stamps))
-        if len(stamps) < 100:
+        if len(self._arrivals) < _LEAST_ARRIVALS:
             return None
+        stamps, arrivals = np.array(self._arrivals, np.float64).T
+        delay, part = arrivals - stamps, (np.arange(len(stamps)) * 10 // len(stamps))
         least = [int(np.flatnonzero(part == k)[np.argmin(delay[part == k])]) for k in range(10)]
         slope = np.polyfit(arrivals[least] - arrivals[0], stamps[least] - stamps[0], 1)[0]
         return float((slope - 1) * 1e6)

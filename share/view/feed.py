@@ -10,8 +10,10 @@ from __future__ import annotations
 import contextlib
 import pickle
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +32,8 @@ _REPORTED = (
     *("delay_ms", "map_id", "keyframes", "loops"),
 )
 END = b""
+_MOST_AT_ONCE = 32  # with keyframes of 30 kB, 1 MB
+_COLLECT_S = 0.03  # between messages; the viewer draws fifteen times a second
 
 
 class _Keyframe(NamedTuple):
@@ -128,9 +132,11 @@ class ViewFeed:
         try:
             while not (self._is_closed and not self._queue):
                 self._wake.wait()
+                if not self._is_closed:
+                    time.sleep(_COLLECT_S)
                 self._wake.clear()
-                for event in self._take_events():
-                    self._connection.send_bytes(pickle.dumps(event, pickle.HIGHEST_PROTOCOL))
+                for events in batched(self._take_events()):
+                    self._connection.send_bytes(pickle.dumps(events, pickle.HIGHEST_PROTOCOL))
             self._connection.send_bytes(END)
         except OSError:  # the viewer's process has ended
             if not self._is_closed:
@@ -167,6 +173,12 @@ class ViewFeed:
                         yield correction
             case _ if isinstance(entry, ev.RoomEvent):
                 yield entry
+
+
+def batched(events: Iterator[ev.RoomEvent]) -> Iterator[list[ev.RoomEvent]]:
+    """Yield the events, several at a time: a message each would cost more than most events do."""
+    while batch := list(islice(events, _MOST_AT_ONCE)):
+        yield batch
 
 
 def _run_shown(run: str, hello: Hello) -> ev.RunShown:

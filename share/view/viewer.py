@@ -27,7 +27,7 @@ DRAW_HZ = 15.0
 _PANEL_S = 0.5  # between updates of the panel
 _NICENESS = 15
 _STOP_S = 2.0
-_MAX_EVENTS = 400  # applied before something is drawn
+_MAX_MESSAGES = 64  # applied before something is drawn
 MISSING = "the live room needs viser: pip install 'viser>=1.1,<2'"
 
 
@@ -124,17 +124,17 @@ class Viewer:
             time.sleep(max(0.005, 1 / DRAW_HZ - (time.monotonic() - start_s)))
 
     def _take_events(self, now_s: float) -> None:
-        for _ in range(_MAX_EVENTS):
+        for _ in range(_MAX_MESSAGES):
             if not self._connection.poll():
                 return
             data = self._connection.recv_bytes()
             if data == END:
                 self._is_ended = True
                 return
-            event = pickle.loads(data)  # of our own parent process
-            self._apply(event, now_s)
-            if isinstance(event, SessionBegun) and event.map_file is not None:
-                self._load(event, now_s)
+            for event in pickle.loads(data):  # of our own parent process
+                self._apply(event, now_s)
+                if isinstance(event, SessionBegun) and event.map_file is not None:
+                    self._load(event, now_s)
 
     def _load(self, event: SessionBegun, now_s: float) -> None:
         from share.view.sources import map_file_shown

@@ -113,3 +113,20 @@ def test_odometry_does_not_jump_when_a_place_is_seen_again(tmp_path):
     moved, should = (se3.inverse(T[:-1]) @ T[1:] for T in (estimate, truth))
     error = np.linalg.norm((se3.inverse(moved) @ should)[:, :3, 3], axis=1)
     assert error.max() < 0.015
+
+
+@pytest.mark.slow
+def test_two_policies_side_by_side(tmp_path):
+    """In the plain room; a second demo replaces the runs of the first."""
+    for words in ((), ("--json",)):
+        seed = ("--scene", "plain", "--seed", "22", "--seconds", "6")
+        done = demo(tmp_path / "cache", tmp_path / "out", "--compare", *seed, *words)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / "out" / "compared.png").read_bytes().startswith(b"\x89PNG")
+        for policy in ("covins-g", "share"):
+            assert (tmp_path / "out" / policy / "run.json").is_file()
+        if words:
+            assert set(json.loads(done.stdout)["runs"]) == {"covins-g", "share"}
+        else:
+            assert re.search(r"covins-g +share +share ÷ covins-g\n +AR latency, ms", done.stdout)
+            assert "share against covins-g: AR latency" in done.stdout

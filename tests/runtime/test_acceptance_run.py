@@ -95,3 +95,17 @@ def test_a_recording_is_judged(plain_session: Path) -> None:
     assert found["tracking"].state.value == "OK", found["tracking"]
     assert found["rest"].state.value == "FAIL"  # too short, and it moves
     assert figures["tracking"]["frames"] == 45 and len(figures["computer"]) >= 1
+
+
+def test_the_device_clock_is_compared_with_the_earliest_arrivals() -> None:
+    """It gains 50 ppm; images come up to 30 ms late, and nobody hears of those that wait."""
+    rng = np.random.default_rng(2)
+
+    def arrived_ns(stamp_ns: int) -> int:
+        return int((stamp_ns - 10**9) * (1 - 50e-6)) + 10**12 + int(rng.exponential(10e6))
+
+    run = AcceptanceRun(SECONDS, lambda text: None, arrived_ns=arrived_ns)
+    assert run.clock_drift_ppm() is None
+    for k in range(900):
+        run.add(frame(k))
+    assert run.clock_drift_ppm() == pytest.approx(50, abs=15)
