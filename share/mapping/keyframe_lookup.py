@@ -174,7 +174,7 @@ class KeyframeLookup:
             return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
         if search is not None and not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
             search.count_verified()
-        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
+        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers, is_confirmed=outcome.is_confirmed)
         counters.merges["requested"] += 1
         change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
         self._log.record_loops(change)

@@ -238,6 +238,8 @@ class LoopAcceptance:
         evidence, min_places = self._weigh_unambiguous(consistent), self._min_places(loop)
         places = f"{evidence.places} of {min_places} required places agree"
         objection = "" if evidence.places >= min_places and evidence.keyframes >= 2 else ": pending"
+        if not any(one.is_confirmed and is_near(one) for one in consistent):
+            objection = objection or ", but the images align by none: pending"
         objection = objection or self._join_objection(loop, evidence) or self._overlap_objection(loop)
         if objection:
             self._add_pending(loop)

@@ -34,7 +34,8 @@ class Loop:
     """A verified relative pose of two keyframes: T_a_b (4, 4) of their bodies, cov (6, 6), inlier count.
 
     found_share: share of the points visible in both views that both views show
-    (`share.mapping.missing_points`); None if not computed.
+    (`share.mapping.missing_points`); None if not computed. is_confirmed: as in `Verification`; not kept in
+    the map file.
     """
 
     a: KeyframeKey
@@ -43,6 +44,7 @@ class Loop:
     cov: F64
     inliers: int
     found_share: float | None = None
+    is_confirmed: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
@@ -65,7 +67,7 @@ class Loop:
     @cached_property
     def _cached_reverse(self) -> Loop:
         T_b_a, cov = se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov)
-        return Loop(self.b, self.a, T_b_a, cov, self.inliers, self.found_share)
+        return Loop(self.b, self.a, T_b_a, cov, self.inliers, self.found_share, self.is_confirmed)
 
     def __str__(self) -> str:
         return f"{self.a} - {self.b}"

@@ -51,7 +51,8 @@ class MapGauge:
         T_shown_map = np.eye(4)
         if known:
             T_shown_map = _gauge([places[s] for s in known], [self._shown[s][1] for s in known])
-        shown = {s: se3.orthonormal(T_shown_map @ place.T_map_odom) for s, place in places.items()}
+        T_map_odom = np.array([place.T_map_odom for place in places.values()]).reshape(-1, 4, 4)
+        shown = dict(zip(places, se3.orthonormal(T_shown_map @ T_map_odom), strict=True))
         self._shown |= {s: (reference_segment, T) for s, T in shown.items()}
         return shown
 

@@ -6,6 +6,8 @@ from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from share.geometry import se3
 from share.mapping.graph.solver import GraphSolution, GraphUpdate
 from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
@@ -221,9 +223,7 @@ class MapSolving:
             is_current = odometry.current_segment(odometry.segments[segment].agent) == segment
             if cov is not None and is_current and last in odometry.nodes:
                 passed[segment] = last, cov
-        shown = self._gauge.show(
-            job.segments[0], {s: self._solved_place(last, cov) for s, (last, cov) in passed.items()}
-        )
+        shown = self._gauge.show(job.segments[0], self._solved_places(passed))
         out: dict[str, Correction] = {}
         failed: dict[str, str] = {}
         for segment, (last, cov) in passed.items():
@@ -235,11 +235,21 @@ class MapSolving:
                 failed[agent] = f"no correction: {error}"
         return out, failed
 
-    def _solved_place(self, node_id: int, cov: F64) -> SolvedPlace:
-        """Where a segment is by its newest solved node. cov (6, 6): of T_map_odom."""
-        graph, T_odom_body = self._graph, self._graph.odometry.nodes[node_id].T_odom_body
-        previous = graph.odometry.previous_node(node_id)
-        step_cov = cov if previous is None else graph.odometry_edge(previous, node_id).cov
-        sigma_m = sigma_ahead(se3.inverse_cov(se3.inverse(T_odom_body), cov))
-        variance = max(_MIN_STEP_VARIANCE, se3.position_sigma(step_cov) ** 2)
-        return SolvedPlace(graph.T_map_odom(node_id), T_odom_body, sigma_m, variance)
+    def _solved_places(self, passed: Mapping[int, tuple[int, F64]]) -> dict[int, SolvedPlace]:
+        """Where segments are by their newest solved nodes. passed: by segment, node and covariance (6, 6) of
+        T_map_odom. At once, since one by one they would take most of applying a solution."""
+        if not passed:
+            return {}
+        graph, odometry = self._graph, self._graph.odometry
+        node_ids = [node_id for node_id, _ in passed.values()]
+        T_odom_body = np.array([odometry.nodes[n].T_odom_body for n in node_ids])
+        T_body_odom = se3.inverse(T_odom_body)
+        T_map_odom = se3.orthonormal(graph.poses.stack(node_ids) @ T_body_odom)
+        body_covs = se3.inverse_cov(T_body_odom, np.array([cov for _, cov in passed.values()]))
+        out = {}
+        for i, (segment, (node_id, cov)) in enumerate(passed.items()):
+            previous = odometry.previous_node(node_id)
+            step_cov = cov if previous is None else graph.odometry_edge(previous, node_id).cov
+            variance = max(_MIN_STEP_VARIANCE, se3.position_sigma(step_cov) ** 2)
+            out[segment] = SolvedPlace(T_map_odom[i], T_odom_body[i], sigma_ahead(body_covs[i]), variance)
+        return out

@@ -445,6 +445,18 @@ def test_a_loop_with_a_third_agent_makes_a_merge_no_weaker(ann: Walker, bob: Wal
     assert not last.accepted
 
 
+def test_a_merge_needs_a_loop_by_which_images_align(ann: Walker, bob: Walker) -> None:
+    """Descriptors of a flat scene may agree on a wrong pose; then no image does."""
+    doubtful = [replace(x, is_confirmed=False) for x in near_loops(ann, bob, np.random.default_rng(0))[:7]]
+    atlas = atlas_of(ann, bob)
+    decisions = [atlas.propose(x) for x in doubtful[:6]]
+    assert not any(d.accepted for d in decisions)
+    assert "6 of 5 required places agree, but the images align by none: pending" in decisions[-1].reason
+    sure = replace(doubtful[6], is_confirmed=True)
+    assert atlas.propose(sure).joined_maps == ("ann/0", "bob/0")
+    assert sure.reverse().is_confirmed and not doubtful[0].reverse().is_confirmed
+
+
 def test_many_views_of_one_spot_are_one_place(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     spot = [loop(ann, i, bob, j, np.random.default_rng(i)) for i in (4, 5) for j in (0, 1, 2)]

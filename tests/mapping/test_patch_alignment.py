@@ -345,6 +345,7 @@ def test_a_pose_whose_patches_disagree_is_kept_and_trusted_less(pairs) -> None:
     shared_sigma = np.hypot(*(view.shared_depth_sigma for view in views))
     assert kept.depth_scale == DepthScale(0.01, 0.02, None, shared_sigma)
     np.testing.assert_allclose(kept.cov, 10 * verified(true).cov)
+    assert orb.is_confirmed and not kept.is_confirmed
     refusal = align_from_map(true, *views)
     assert isinstance(refusal, Refusal) and "agree with one pose" in refusal.reason
 

@@ -62,6 +62,7 @@ _MAX_STEPS = 64  # newest of each agent
 _MIN_STEPS = 8
 _CLAIM_TOLERANCE = 2.25  # variance (1.5 sigma), by which good agents differ as they move differently
 _MAX_CLAIM_SCALE = 100.0  # variance; without evidence from loops no more is applied
+_SAME_MEDIAN = 0.02  # of the logarithm; with a smaller change, all agents' scales need not be estimated anew
 _LEVER_M = 1.0  # length of a step equivalent to a rotation of 1 rad
 
 
@@ -95,7 +96,10 @@ class CovarianceClaims:
         steps.append((np.log(rotation_variance / size), np.log(position_variance / size)))
         if len(steps) < _MIN_STEPS:
             return False
-        self._medians[agent] = np.median(np.array(steps), axis=0)
+        median = np.median(np.array(steps), axis=0)
+        if agent in self._medians and np.abs(median - self._medians[agent]).max() < _SAME_MEDIAN:
+            return False
+        self._medians[agent] = median
         return bool(self._linked.get(agent))
 
     def link(self, first: str, second: str) -> None:

@@ -28,15 +28,19 @@ class ShortestPaths:
 
     def add(self, n: int, a: I64, b: I64, cost: F64, index: I64) -> None:
         """Add edges with these indices. n: number of poses with theirs."""
-        start, target = np.concatenate([a, b]), np.concatenate([b, a])
-        order = np.argsort(start, kind="stable")
-        start, both = start[order], np.concatenate([index, index])[order]
-        starts = np.concatenate([self._starts, np.full(n + 1 - len(self._starts), self._starts[-1])])
-        at = starts[start + 1]
-        self._targets = np.insert(self._targets, at, target[order])
-        self._edge_index = np.insert(self._edge_index, at, both)
-        self._cost = np.insert(self._cost, at, _positive(np.concatenate([cost, cost])[order]))
-        self._set_starts(starts + np.concatenate([[0], np.cumsum(np.bincount(start, minlength=n))]))
+        target, both = np.concatenate([b, a]), np.concatenate([index, index])
+        added, order = _by_start(n, np.concatenate([a, b]))
+        new = target[order].astype(np.int32), both[order], _positive(np.concatenate([cost, cost])[order])
+        if len(self._cost):
+            starts = np.concatenate([self._starts, np.full(n + 1 - len(self._starts), self._starts[-1])])
+            at = np.repeat(starts[1:], np.diff(added))  # behind those of the same start
+            self._targets = np.insert(self._targets, at, new[0])
+            self._edge_index = np.insert(self._edge_index, at, new[1])
+            self._cost = np.insert(self._cost, at, new[2])
+            added = starts + added
+        else:
+            self._targets, self._edge_index, self._cost = new
+        self._set_starts(added)
 
     def remove(self, a: I64, b: I64, index: I64) -> None:
         """Remove the edges with these ends and indices: no path uses them, and when many are gone they leave
@@ -105,6 +109,15 @@ class ShortestPaths:
 
         self._starts, n = starts.astype(np.int32), len(starts) - 1
         self._graph = csr_array((self._cost, self._targets, self._starts), shape=(n, n))
+
+
+def _by_start(n: int, start: I64) -> tuple[I64, I64]:
+    """Sort edges by their start (E,), one of n poses: where those of each begin (n + 1,), and order (E,)."""
+    from scipy.sparse import csc_array
+
+    e = len(start)  # one column each, transposed: a counting sort
+    leaving = csc_array((np.ones(e, np.int8), start, np.arange(e + 1)), shape=(n, e)).tocsr()
+    return leaving.indptr, leaving.indices
 
 
 def _positive(cost: F64) -> F64:

@@ -156,7 +156,7 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
     scale = verified.depth_scale
     if scale is not None:
         scale = scale._replace(shared_sigma=_shared_sigma(query, candidate))
-    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov, depth_scale=scale)
+    return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov, depth_scale=scale, is_confirmed=False)
 
 
 def align_unsure(refused: Refusal, query: ImageView, candidate: ImageView) -> Verification | Refusal:

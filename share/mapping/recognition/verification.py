@@ -78,7 +78,8 @@ class Verification:
     """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6): its covariance.
 
     matches: descriptor pairs; inliers: those that agree with the pose. depth_scale: of the query's depths
-    relative to the candidate's; None where too few points have both.
+    relative to the candidate's; None where too few points have both. is_confirmed: False where the images
+    were compared and their patches do not align by this pose.
     """
 
     T_c_q: F64
@@ -86,6 +87,7 @@ class Verification:
     matches: int
     inliers: int
     depth_scale: DepthScale | None = None
+    is_confirmed: bool = True
 
     @property
     def reason(self) -> str:
