@@ -53,7 +53,7 @@ class CorrectionDelay:
             arrived_ns, sent_ns = self._waiting.pop(keyframe)
             self._acknowledged_ms[keyframe] = (now_ns - arrived_ns) / 1e6
             self._to_ack.add(self._acknowledged_ms[keyframe], now_ns)
-            acks_ms.append((now_ns - sent_ns) / 1e6)
+            acks_ms.append(max(0, now_ns - sent_ns) / 1e6)  # it may be held, and the edge may lie
             self._newest_ack_ms = acks_ms[-1]
         while len(self._acknowledged_ms) > _MAX_ACKNOWLEDGED:
             del self._acknowledged_ms[next(iter(self._acknowledged_ms))]
