@@ -41,7 +41,7 @@ class CorrectionDelay:
         self._newest_ack_ms = 0.0
 
     def add_keyframe(self, keyframe: int, arrived_ns: int, sent_ns: int) -> None:
-        """Add a keyframe, to be sent at `sent_ns`."""
+        """Add a keyframe that is sent now."""
         if len(self._waiting) < _MAX_WAITING:
             self._waiting[keyframe] = arrived_ns, sent_ns
 
@@ -53,7 +53,7 @@ class CorrectionDelay:
             arrived_ns, sent_ns = self._waiting.pop(keyframe)
             self._acknowledged_ms[keyframe] = (now_ns - arrived_ns) / 1e6
             self._to_ack.add(self._acknowledged_ms[keyframe], now_ns)
-            acks_ms.append(max(0, now_ns - sent_ns) / 1e6)  # an edge that lies has it before it is sent
+            acks_ms.append(max(0, now_ns - sent_ns) / 1e6)  # it may be held, and the edge may lie
             self._newest_ack_ms = acks_ms[-1]
         while len(self._acknowledged_ms) > _MAX_ACKNOWLEDGED:
             del self._acknowledged_ms[next(iter(self._acknowledged_ms))]

@@ -87,3 +87,11 @@ def test_memory_is_bounded() -> None:
     assert len(delay._waiting) <= 1000 and len(part._received_ns) <= 64
     delay.acknowledge(5000, 6000 * MS)
     assert len(delay._acknowledged_ms) <= 64
+
+
+def test_a_keyframe_that_is_acknowledged_before_it_is_sent_took_no_time() -> None:
+    """It is held, and the edge says that it has it."""
+    delay = CorrectionDelay()
+    delay.add_keyframe(0, 0, 10 * 10**9)
+    assert delay.acknowledge(1, 10**9) == [0.0]
+    assert delay.ack_ms(2 * 10**9) == 0.0
