@@ -126,8 +126,8 @@ def _poses_address(text: str) -> HostPort:
     host = parse_host(text.removeprefix(UDP), DEFAULT_PORT, bind=True)
     if host.name not in ("127.0.0.1", "::1"):
         raise UsageError(
-            f"--poses {text}: poses that come over a network could be forged, and steer the robot; run the bridge on "
-            f"the agent's machine, with udp://127.0.0.1:{host.port}"
+            f"--poses {text}: poses that come over a network could be forged, and steer the robot; "
+            f"run the bridge on the agent's machine, with udp://127.0.0.1:{host.port}"
         )
     return host
 

@@ -17,7 +17,7 @@ from share.robot.planar import PlanarPose
 from share.robot.settings import RobotSettings
 from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
 
-LEAD_S = 0.2  # map → odom is valid so far ahead: tf2 does not extrapolate
+LEAD_S = 0.3  # map → odom is valid so far ahead: tf2 does not extrapolate
 PUBLISH_S = 0.02
 _TOO_FAST_S = 0.5
 _SPEED_MARGIN = 1.25  # of the limit: a controller overshoots
@@ -231,8 +231,8 @@ class RobotBridge:
             return "still looking for the robot"
         if not robot.has_participants:
             return (
-                "there is nothing on this domain; give the robot's --domain, or --peer ADDRESS where the network has "
-                "no multicast; a robot with a discovery server is invisible: set it to simple discovery"
+                "there is nothing on this domain; give the robot's --domain, or --peer ADDRESS where the network "
+                "has no multicast; a robot with a discovery server is invisible: set it to simple discovery"
             )
         if robot.servers == 0:
             others = " or ".join(f"--namespace {one}" for one in robot.others)

@@ -130,7 +130,10 @@ class MapOdom:
     def fault(self, now_ns: int) -> str | None:
         """Return why the robot's place in the map is not known; None if it is."""
         if self._foreign_ns is not None and now_ns - self._foreign_ns <= _FOREIGN_NS:
-            return f"another program publishes {self._foreign} → odom; turn AMCL, slam_toolbox or that bridge off"
+            return (
+                f"another program publishes {self._foreign} → odom; "
+                "turn AMCL, slam_toolbox or that bridge off"
+            )
         if self._odometry_fault is not None:
             return self._odometry_fault
         if self._odometry_ns is None or now_ns - self._odometry_ns > _STALE_NS:

@@ -25,10 +25,10 @@ _STATUSES = {
 
 
 class NavigateClient:
-    """has_error_code: whether results have a reason; Humble's do not."""
+    """has_error_code: whether results are known to have a reason; Humble's have none."""
 
     def __init__(self, topics: RosTopics) -> None:
-        self.has_error_code = True
+        self.has_error_code = False
         self._goal = topics.writer(
             f"{_ACTION}/send_goalRequest", types.SendGoalRequest, depth=10, prefix="rq"
         )
@@ -92,14 +92,17 @@ class NavigateClient:
         """Whether the server's ends of goal and cancellation are known."""
         return bool(self._goal.get_matched_subscriptions()) and bool(self._cancel.get_matched_subscriptions())
 
-    def feedback_user_data(self) -> bytes:
-        """Return what the publisher of feedback tells about itself."""
-        for handle in self._feedback.get_matched_publications():
-            if (data := self._feedback.get_matched_publication_data(handle)) is not None:
-                for policy in data.qos:
-                    if type(policy).__name__ == "Userdata":
-                        return bytes(policy.data)
-        return b""
+    def user_data(self) -> tuple[bytes | None, bytes | None]:
+        """Return what the publishers of results and of feedback tell about themselves; None before they are
+        found."""
+        return _user_data(self._results), _user_data(self._feedback)
+
+
+def _user_data(reader: Any) -> bytes | None:
+    for handle in reader.get_matched_publications():
+        if (data := reader.get_matched_publication_data(handle)) is not None:
+            return b"".join(policy.data for policy in data.qos if type(policy).__name__ == "Userdata")
+    return None
 
 
 def _uuid(goal_id: bytes) -> Any:

@@ -30,13 +30,13 @@ def parse_pose_message(data: bytes) -> AgentPoseReceived:
         raise WireError(f"not of schema {SCHEMA}; agent and bridge have to be of one release")
     try:
         return _event(message)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise WireError(f"{type(error).__name__}: {printable(str(error))[:80]}") from None
 
 
 def _event(message: dict[str, Any]) -> AgentPoseReceived:
     agent, sequence, age_ms = message["agent"], message["sequence"], message["age_ms"]
-    in_map, map_id, has_edge = message["map"], message["map_id"], message.get("connected")
+    in_map, map_id, has_edge = message["map"], message["map_id"], message.get("edge")
     if not isinstance(agent, str) or not isinstance(sequence, int) or not isinstance(map_id, str | None):
         raise ValueError("agent, sequence or map_id is of another type")
     if age_ms is not None and not 0 <= age_ms <= _MAX_AGE_MS:
@@ -65,6 +65,8 @@ def _sigma_m(covariance: list[float] | None) -> float | None:
     if covariance is None:
         return None
     (xx, yy), xy = (covariance[i] for i in _VARIANCES), covariance[_COVARIANCE_XY]
+    if len(covariance) != 21 or xx < 0 or yy < 0:
+        raise ValueError("no covariance")
     largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
     if not 0 <= largest < 1e12:
         raise ValueError("no covariance")

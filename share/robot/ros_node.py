@@ -28,7 +28,9 @@ _DISCOVERY_NS = 3_000_000_000  # a cold discovery takes 1 to 2 s
 _SETTLE_NS = 600_000_000  # after a match, before the first goal: the server has to match the client too
 _FAST_DDS = b"\x01\x0f"  # vendor at the beginning of a participant's key
 _HASH = re.compile(rb"typehash=(RIHS01_[0-9a-f]{64})")
-# of NavigateToPose_FeedbackMessage with the fields that Nav2 has in Jazzy
+# of NavigateToPose's result with an empty one (Humble), and with a code and a text; of its feedback in Jazzy
+_EMPTY_RESULT = b"RIHS01_6acfb8cff093868001fe9b46e1262c481cd65cc06e93b655548ded7640b050b0"
+_RESULT = b"RIHS01_c59f178c377de5318919c00bdbf7884cb3b185acfdffceba6c9f161e0aa3cc81"
 _JAZZY_FEEDBACK = b"RIHS01_9d1f6fa2eb975ce733b419ac2e97b134d8ff92b6478b6559feed9a50bdfd82b3"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
@@ -121,8 +123,8 @@ class RosNode:
         is_settled = self._matched_ns is not None and now_ns - self._matched_ns >= _SETTLE_NS
         others = () if servers else tuple(self.topics.namespaces_with("navigate_to_pose/_action/status"))
         publishers = len(self._odometry.get_matched_publications())
-        release = _release(self._navigate.feedback_user_data()) if servers else ""
-        self._navigate.has_error_code = release != "humble"
+        release = _release(*self._navigate.user_data()) if servers else ""
+        self._navigate.has_error_code = release in ("jazzy", "newer")
         is_fast = all(server.participant_key.bytes[:2] == _FAST_DDS for server in servers)
         return ev.RobotDiscovered(
             len(servers) if is_settled else 0,
@@ -187,11 +189,17 @@ def _yaw_quaternion(types: Any, yaw: float) -> Any:
     return types.RosQuaternion(0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
 
 
-def _release(user_data: bytes) -> str:
-    """Return the ROS release by what a publisher of feedback tells of its type: Humble tells nothing."""
-    if (match := _HASH.search(user_data)) is None:
+def _release(result_data: bytes | None, feedback_data: bytes | None) -> str:
+    """Return the ROS release by what the publishers of results and feedback tell of their types: Humble's say
+    nothing; "" for types that no release has, or before they are found."""
+    if result_data is None or feedback_data is None:
+        return ""
+    result, feedback = (_HASH.search(data) for data in (result_data, feedback_data))
+    if result is None or result[1] == _EMPTY_RESULT:
         return "humble"
-    return "jazzy" if match[1] == _JAZZY_FEEDBACK else "newer"
+    if result[1] != _RESULT or feedback is None:
+        return ""
+    return "jazzy" if feedback[1] == _JAZZY_FEEDBACK else "newer"
 
 
 def _configuration(peers: Sequence[str]) -> str:

@@ -33,7 +33,7 @@ class RosTopics:
             self._participant = DomainParticipant(domain)
         except DDSException as error:
             raise TransportError(
-                f"DDS domain {domain}: cannot be joined ({error}); is the network up, and no peer's name wrong?"
+                f"DDS domain {domain}: cannot be joined ({error}); is the network up, and each --peer right?"
             ) from None
         self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._participants = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)

@@ -182,8 +182,8 @@ def ask_bridge(path: Path, wish: dict[str, Any]) -> Iterator[dict[str, Any]]:
             link.connect(str(path))
         except OSError:
             raise ShareError(
-                "no bridge of this robot runs on this machine; start `share robot bridge`, with the same --domain "
-                "and --namespace"
+                "no bridge of this robot runs on this machine; start `share robot bridge`, "
+                "with the same --domain and --namespace"
             ) from None
         link.settimeout(None)
         link.sendall(json.dumps(wish).encode() + b"\n")

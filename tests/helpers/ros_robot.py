@@ -1,10 +1,12 @@
 """A robot of ROS 2 as a node of rclpy: odometry on an arc, a TF listener, the latched map, NavigateToPose.
 
-Run by the Python of ROS: `python ros_robot.py BEGIN_S DRIVE_S [NAMESPACE]`. It writes a line of JSON for whatever it
-receives. tf2 is in no wheel: `map → odom` is looked up as tf2 does, between two stamps and never beyond the last.
+Run by the Python of ROS: `python ros_robot.py BEGIN_S DRIVE_S [NAMESPACE]`. It writes a line of JSON for
+whatever it receives. tf2 is in no wheel: `map → odom` is looked up as tf2 does, between two stamps and
+never beyond the last.
 """
 
 import bisect
+import contextlib
 import json
 import math
 import sys
@@ -72,7 +74,10 @@ class RosRobot(Node):
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
         message.pose.pose.position.x, message.pose.pose.position.y = x, y
-        message.pose.pose.orientation.z, message.pose.pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+        message.pose.pose.orientation.z, message.pose.pose.orientation.w = (
+            math.sin(yaw / 2),
+            math.cos(yaw / 2),
+        )
         message.twist.twist.linear.x = 0.15
         self.odometry.publish(message)
         transform = TransformStamped()
@@ -157,4 +162,5 @@ if __name__ == "__main__":
     executor = MultiThreadedExecutor(4)
     executor.add_node(robot)
     say(ready=True)
-    executor.spin()
+    with contextlib.suppress(KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+        executor.spin()

@@ -41,7 +41,9 @@ pytestmark = [
     pytest.mark.skipif(ROS is None, reason="SHARE_ROS names no environment with rclpy (CONTRIBUTING.md)"),
     pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="cyclonedds is not installed"),
 ]
-SECONDS = float(os.environ.get("SHARE_ROS_SECONDS", "15"))  # of the measurement of TF; 120 for docs/do/robot.md
+SECONDS = float(
+    os.environ.get("SHARE_ROS_SECONDS", "15")
+)  # of the measurement of TF; 120 for docs/do/robot.md
 AGE_S, POSE_HZ = 0.015, 30
 
 
@@ -51,7 +53,8 @@ def odometry_at(seconds: float) -> PlanarPose:
 
 
 def map_odom_at(seconds: float) -> PlanarPose:
-    """What corrections make of the map: a step of 1.2 cm and 0.2° every 4 s, at 15 mm/s, beside a steady drift."""
+    """What corrections make of the map: a step of 1.2 cm and 0.2° every 4 s, at 15 mm/s, beside a steady
+    drift."""
     steps, into = divmod(seconds, 4.0)
     moved = 0.012 * (steps + min(1.0, into / 0.8))
     return PlanarPose(2.0 + moved, -1.0 + 0.002 * seconds, 0.4 + 0.3 * moved)
@@ -72,7 +75,9 @@ def messages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 class RosProcess:
     """The node in its own process, and what it says."""
 
-    def __init__(self, folder: Path, domain: int, begin_s: float, drive_s: float, namespace: str = "") -> None:
+    def __init__(
+        self, folder: Path, domain: int, begin_s: float, drive_s: float, namespace: str = ""
+    ) -> None:
         environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
             "PYTHONPATH": str(folder / "site"),
@@ -113,7 +118,9 @@ class RosProcess:
 class Room:
     """Agent, bridge and robot: `run` lets time pass."""
 
-    def __init__(self, folder: Path, domain: int, tmp_path: Path, namespace: str = "", drive_s: float = 2.0) -> None:
+    def __init__(
+        self, folder: Path, domain: int, tmp_path: Path, namespace: str = "", drive_s: float = 2.0
+    ) -> None:
         from share.robot.ros_node import RosNode
         from share.runtime.robot_bridge import RobotBridgeRun
         from share.runtime.robot_commands import CommandServer
@@ -142,7 +149,9 @@ class Room:
             since = stamp_s - self.begin_s
             T = solid(map_odom_at(since) @ odometry_at(since)) @ T_BASE_BODY
             cov = np.eye(6) * 1e-4
-            pose = Pose(round(stamp_s * 1e9), self.state, T, T, "ann-1/0", cov=cov, map_cov=cov, age_ms=AGE_S * 1e3)
+            pose = Pose(
+                round(stamp_s * 1e9), self.state, T, T, "ann-1/0", cov=cov, map_cov=cov, age_ms=AGE_S * 1e3
+            )
             text = self.messages.of_pose(pose)
         self.sender.sendto(text.encode(), ("127.0.0.1", self.poses.port))
 
@@ -208,7 +217,8 @@ def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[...,
     errors = np.hypot(rows[:, 1] - [p.x for p in truth], rows[:, 2] - [p.y for p in truth])
     print(
         f"\nmap → base_link: {1e3 * np.sqrt((errors**2).mean()):.2f} mm rms, {1e3 * errors.max():.1f} max, "
-        f"n {len(rows)}, extrapolations {len(here.robot.of('tf_missing'))}, ahead {min(ahead):.3f}–{max(ahead):.3f} s, "
+        f"n {len(rows)}, extrapolations {len(here.robot.of('tf_missing'))}, "
+        f"ahead {min(ahead):.3f}–{max(ahead):.3f} s, "
         f"CPU of bridge and agent {100 * cpu:.1f} %"
     )
     assert len(rows) > 8 * SECONDS
@@ -216,7 +226,9 @@ def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[...,
     assert not here.robot.of("error")
 
 
-def test_the_map_is_latched_and_the_body_is_known(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+def test_the_map_is_latched_and_the_body_is_known(
+    messages: tuple[str, Path], room: Callable[..., Room]
+) -> None:
     here = room()
     assert here.run(5.0, lambda: here.robot.of("map") and here.robot.of("static"))
     (told,) = here.robot.of("map")
@@ -263,6 +275,16 @@ def test_a_refused_goal(room: Callable[..., Room]) -> None:
     here.goto(500.0, 0.0)
     assert here.run(15.0, here.ended)
     assert "refuses the goal" in here.reports[-1].text or "no answer" in here.reports[-1].text
+
+
+def test_a_goal_that_fails_says_why(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+    here = room(drive_s=20.0)
+    here.goto()
+    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    here.node.publish_map_odom = lambda *_: None  # type: ignore[method-assign]
+    assert here.run(5.0, here.ended)
+    text = "without a reason" if messages[0] == "humble" else "Nav2's error 9002, no transform"
+    assert text in here.reports[-1].text
 
 
 def test_namespace(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
