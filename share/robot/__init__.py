@@ -5,6 +5,6 @@
 `navigate` carry that out by DDS (`ros_types`), imported only when a bridge runs.
 
 Frames: `map` is SHARE's. `odom` here is the robot's, of its wheels, as in ROS; an agent's `odom` of
-visual-inertial odometry is another frame, which no robot sees. `base` is ROS's `base_link`: x ahead, y
+visual-inertial odometry is another frame, which no robot sees. The base is ROS's base_link: x ahead, y
 left, z up.
 """
