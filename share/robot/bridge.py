@@ -232,7 +232,8 @@ class RobotBridge:
         if not robot.has_participants:
             return (
                 "there is nothing on this domain; give the robot's --domain, or --peer ADDRESS where the "
-                "network has no multicast; a robot with a discovery server is invisible: set it to simple discovery"
+                "network has no multicast; a robot with a discovery server is invisible: "
+                "set it to simple discovery"
             )
         if robot.servers == 0:
             others = " or ".join(f"--namespace {one}" for one in robot.others)

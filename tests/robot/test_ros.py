@@ -11,8 +11,10 @@ import json
 import math
 import os
 import queue
+import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +23,7 @@ from pathlib import Path
 import helpers.ros_messages
 import numpy as np
 import pytest
+import yaml
 from helpers.robot_drive import T_BASE_BODY, solid
 
 from share.geometry.se3 import inverse
@@ -295,3 +298,146 @@ def test_namespace(messages: tuple[str, Path], room: Callable[..., Room]) -> Non
     assert here.run(15.0, here.ended)
     assert here.reports[-1].is_reached
     assert here.node.topics.namespaces_with("navigate_to_pose/_action/status") == []
+
+
+# ------------------------------------------------------------ as processes
+
+
+class Feeder(threading.Thread):
+    """An agent that sends its poses to a port, until stopped."""
+
+    def __init__(self, begin_s: float, port: int) -> None:
+        super().__init__(daemon=True)
+        self.begin_s, self.port, self.is_ended = begin_s, port, False
+
+    def run(self) -> None:
+        messages, cov = PoseMessages("bot"), np.eye(6) * 1e-4
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not self.is_ended:
+                stamp_s = time.time() - AGE_S
+                since = stamp_s - self.begin_s
+                T = solid(map_odom_at(since) @ odometry_at(since)) @ T_BASE_BODY
+                known = {"cov": cov, "map_cov": cov, "age_ms": AGE_S * 1e3, "is_connected": True}
+                pose = Pose(round(stamp_s * 1e9), TrackState.OK, T, T, "ann-1/0", **known)
+                sender.sendto(messages.of_pose(pose).encode(), ("127.0.0.1", self.port))
+                time.sleep(1 / POSE_HZ)
+
+
+class Commands:
+    """`share robot …` as processes, against one robot."""
+
+    def __init__(self, folder: Path, tmp_path: Path, drive_s: float = 30.0) -> None:
+        self.domain, begin_s = 140 + os.getpid() % 60, time.time()
+        self.robot = RosProcess(folder, self.domain, begin_s, drive_s)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.feeder = Feeder(begin_s, self.port)
+        self.feeder.start()
+        self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "ROS_DOMAIN_ID": str(self.domain)}
+        self.file, self.tmp_path = tmp_path / "robot.yaml", tmp_path
+        self.file.write_text(yaml.safe_dump({"T_base_body": T_BASE_BODY.tolist()}))
+        self.processes: list[subprocess.Popen[str]] = []
+        self.bridges = 0
+
+    def start(self, *words: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "share", "robot", *words]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        self.processes.append(subprocess.Popen(command, env=self.environment, **pipes))
+        return self.processes[-1]
+
+    def start_bridge(self) -> subprocess.Popen[str]:
+        """Start a bridge and wait until it takes goals."""
+        poses = f"udp://127.0.0.1:{self.port}"
+        bridge = self.start("bridge", "--robot", str(self.file), "--allow-goals", "--poses", poses)
+        watch = self.start("watch", "--json")
+        for _ in range(100):
+            if (self.tmp_path / f"share-robot-{self.domain}.sock").exists() and watch.poll() is None:
+                break
+            time.sleep(0.1)
+            if watch.poll() is not None:
+                watch = self.start("watch", "--json")
+        assert watch.stdout is not None
+        for line in watch.stdout:
+            state = json.loads(line).get("state")
+            if state is not None and state["refusal"] is None:
+                break
+        else:
+            raise AssertionError(bridge.stderr.read() if bridge.poll() is not None else "no state")
+        watch.kill()
+        return bridge
+
+    def wait_for(self, key: str, value: object = None, seconds: float = 15.0) -> None:
+        """Wait until the robot says something."""
+        end = time.time() + seconds
+        while time.time() < end:
+            if any(value is None or one[key] == value for one in self.robot.of(key)):
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"no {key} {value}: {self.robot.said[-5:]}")
+
+    def end(self) -> None:
+        self.feeder.is_ended = True
+        self.feeder.join()
+        for process in self.processes:
+            process.kill()
+            process.communicate()
+        self.robot.end()
+
+
+@pytest.fixture
+def commands(tmp_path: Path, messages: tuple[str, Path]) -> Iterator[Callable[..., Commands]]:
+    if messages[0] != "jazzy":
+        pytest.skip("one release is enough")
+    made: list[Commands] = []
+
+    def make(**more: float) -> Commands:
+        made.append(Commands(messages[1], tmp_path, **more))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.end()
+
+
+def test_share_robot_goto(commands: Callable[..., Commands]) -> None:
+    here = commands(drive_s=1.0)
+    here.start_bridge()
+    out, err = here.start("goto", "1.5", "-0.5", "90", "--json").communicate(timeout=20)
+    assert json.loads(out) == {"reached": True, "text": "reached"}, err
+
+
+def test_goto_that_is_killed_stops_the_robot_and_cancel_too(commands: Callable[..., Commands]) -> None:
+    here = commands()
+    here.start_bridge()
+    goto = here.start("goto", "1.5", "-0.5")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    goto.kill()
+    here.wait_for("ended", "canceled")
+    here.robot.forget()
+    goto = here.start("goto", "1.0", "0.0")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    assert here.start("cancel").wait(timeout=10) == 0
+    here.wait_for("ended", "canceled")
+    _, err = goto.communicate(timeout=10)
+    assert goto.returncode == 1 and "cancelled by `share robot cancel`" in err
+
+
+def test_a_bridge_that_ends_or_dies_leaves_no_goal(commands: Callable[..., Commands]) -> None:
+    here = commands()
+    bridge = here.start_bridge()
+    here.start("goto", "1.5", "-0.5")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    bridge.send_signal(signal.SIGINT)
+    here.wait_for("ended", "canceled")
+    assert bridge.wait(timeout=10) == 0
+    here.robot.forget()
+    bridge = here.start_bridge()
+    here.start("goto", "1.5", "-0.5")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    bridge.kill()
+    here.wait_for("ended", "aborted")  # without map → odom
