@@ -22,7 +22,7 @@ from share.robot.ros_node import RosNode
 from share.runtime.robot_commands import CommandServer
 from share.timing import LineLimiter
 
-_TICK_S = 0.02
+_TICK_S = 0.01  # odometry waits so long at most
 _END_NS = 2_000_000_000
 _MAX_DATAGRAMS = 64  # in one step
 

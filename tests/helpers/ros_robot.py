@@ -1,8 +1,9 @@
 """A robot of ROS 2 as a node of rclpy: odometry on an arc, a TF listener, the latched map, NavigateToPose.
 
-Run by the Python of ROS: `python ros_robot.py BEGIN_S DRIVE_S [NAMESPACE]`. It writes a line of JSON for
-whatever it receives. tf2 is in no wheel: `map → odom` is looked up as tf2 does, between two stamps and
-never beyond the last.
+Run by the Python of ROS: `python ros_robot.py BEGIN_S DRIVE_S [NAMESPACE [FAULT]]`. FAULT: amcl (it publishes
+map → odom itself), nan, behind (its clock by 90 s), simulated (its clock begins at 0). It writes a line of
+JSON for whatever it receives. tf2 is in no wheel: `map → odom` is looked up as tf2 does, between two stamps
+and never beyond the last.
 """
 
 import bisect
@@ -43,9 +44,9 @@ def say(**message: object) -> None:
 
 
 class RosRobot(Node):
-    def __init__(self, begin_s: float, drive_s: float, namespace: str) -> None:
+    def __init__(self, begin_s: float, drive_s: float, namespace: str, fault: str) -> None:
         super().__init__("robot", namespace=namespace)
-        self.begin_s, self.drive_s = begin_s, drive_s
+        self.begin_s, self.drive_s, self.fault = begin_s, drive_s, fault
         self.stamps: list[float] = []
         self.transforms: list[tuple[float, float, float]] = []
         group = ReentrantCallbackGroup()
@@ -70,6 +71,12 @@ class RosRobot(Node):
     def send_odometry(self) -> None:
         now_ns = time.time_ns()
         x, y, yaw = odometry_at(now_ns / 1e9 - self.begin_s)
+        if self.fault == "behind":
+            now_ns -= 90 * 10**9
+        elif self.fault == "simulated":
+            now_ns -= round(self.begin_s * 1e9)
+        elif self.fault == "nan":
+            x = math.nan
         message = Odometry()
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 10**9)
@@ -85,6 +92,10 @@ class RosRobot(Node):
         transform.transform.translation.x, transform.transform.translation.y = x, y
         transform.transform.rotation = message.pose.pose.orientation
         self.tf.publish(TFMessage(transforms=[transform]))
+        if self.fault == "amcl":
+            other = TransformStamped(child_frame_id="odom")
+            other.header.stamp, other.header.frame_id = message.header.stamp, "map"
+            self.tf.publish(TFMessage(transforms=[other]))
 
     def on_tf(self, message: TFMessage) -> None:
         for one in message.transforms:
@@ -158,7 +169,8 @@ class RosRobot(Node):
 
 if __name__ == "__main__":
     rclpy.init()
-    robot = RosRobot(float(sys.argv[1]), float(sys.argv[2]), *sys.argv[3:4] or [""])
+    namespace, fault = [*sys.argv[3:5], "", ""][:2]
+    robot = RosRobot(float(sys.argv[1]), float(sys.argv[2]), namespace, fault)
     executor = MultiThreadedExecutor(4)
     executor.add_node(robot)
     say(ready=True)

@@ -79,7 +79,13 @@ class RosProcess:
     """The node in its own process, and what it says."""
 
     def __init__(
-        self, folder: Path, domain: int, begin_s: float, drive_s: float, namespace: str = ""
+        self,
+        folder: Path,
+        domain: int,
+        begin_s: float,
+        drive_s: float,
+        namespace: str = "",
+        fault: str = "",
     ) -> None:
         environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
@@ -88,7 +94,8 @@ class RosProcess:
             "ROS_DOMAIN_ID": str(domain),
             "ROS_LOG_DIR": str(folder / "log"),
         }
-        command = [f"{ROS}/bin/python", str(HELPERS / "ros_robot.py"), str(begin_s), str(drive_s), namespace]
+        words = [str(begin_s), str(drive_s), namespace, fault]
+        command = [f"{ROS}/bin/python", str(HELPERS / "ros_robot.py"), *words]
         self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
         self.lines: queue.Queue[dict] = queue.Queue()
         self.said: list[dict] = []
@@ -122,14 +129,23 @@ class Room:
     """Agent, bridge and robot: `run` lets time pass."""
 
     def __init__(
-        self, folder: Path, domain: int, tmp_path: Path, namespace: str = "", drive_s: float = 2.0
+        self,
+        folder: Path,
+        domain: int,
+        tmp_path: Path,
+        namespace: str = "",
+        drive_s: float = 2.0,
+        fault: str = "",
+        robots: tuple[str, ...] | None = None,
     ) -> None:
         from share.robot.ros_node import RosNode
         from share.runtime.robot_bridge import RobotBridgeRun
         from share.runtime.robot_commands import CommandServer
 
         self.begin_s = time.time()
-        self.robot = RosProcess(folder, domain, self.begin_s, drive_s, namespace)
+        names = (namespace,) if robots is None else robots  # namespaces in which there is a robot
+        self.robots = [RosProcess(folder, domain, self.begin_s, drive_s, name, fault) for name in names]
+        self.robot = self.robots[0] if self.robots else None
         self.poses = StampedSocket.bind(HostPort("127.0.0.1", 0))
         self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.commands = CommandServer(tmp_path / "robot.sock")
@@ -165,7 +181,7 @@ class Room:
             if time.time() >= self.next_s:
                 self.next_s = max(self.next_s + 1 / POSE_HZ, time.time())
                 self.send_pose()
-            self.run_.step(min(0.02, max(0.0, self.next_s - time.time())))
+            self.run_.step(min(0.01, max(0.0, self.next_s - time.time())))
             if until():
                 return True
         return bool(until())
@@ -181,7 +197,8 @@ class Room:
         return self.run_.bridge.report(time.monotonic_ns())["refusal"] is None
 
     def close(self) -> None:
-        self.robot.end()
+        for robot in self.robots:
+            robot.end()
         self.node.close()
         self.commands.close()
         self.poses.close()
@@ -194,9 +211,11 @@ def room(
 ) -> Iterator[Callable[..., Room]]:
     rooms: list[Room] = []
 
-    def open_room(**more: object) -> Room:
+    def open_room(is_ready: bool = True, **more: object) -> Room:
         domain = 40 + os.getpid() % 60
         rooms.append(Room(messages[1], domain, tmp_path, **more))
+        if not is_ready:
+            return rooms[-1]
         assert rooms[-1].run(30.0, rooms[-1].is_ready), rooms[-1].printed
         return rooms[-1]
 
@@ -211,6 +230,14 @@ def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[...,
     here = room()
     here.run(1.0)
     here.robot.forget()
+    sent: list[float] = []
+    publish = here.node.publish_map_odom
+
+    def publish_and_note(stamp_ns: int, T_map_odom: PlanarPose) -> None:
+        sent.append(time.time())
+        publish(stamp_ns, T_map_odom)
+
+    here.node.publish_map_odom = publish_and_note  # type: ignore[method-assign]
     begin, cpu = time.time(), time.process_time()
     here.run(SECONDS)
     cpu = (time.process_time() - cpu) / SECONDS
@@ -222,6 +249,7 @@ def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[...,
         f"\nmap → base_link: {1e3 * np.sqrt((errors**2).mean()):.2f} mm rms, {1e3 * errors.max():.1f} max, "
         f"n {len(rows)}, extrapolations {len(here.robot.of('tf_missing'))}, "
         f"ahead {min(ahead):.3f}–{max(ahead):.3f} s, "
+        f"{len(sent) / SECONDS:.0f} a second, longest gap {1e3 * max(np.diff(sent)):.0f} ms, "
         f"CPU of bridge and agent {100 * cpu:.1f} %"
     )
     assert len(rows) > 8 * SECONDS
@@ -298,6 +326,34 @@ def test_namespace(messages: tuple[str, Path], room: Callable[..., Room]) -> Non
     assert here.run(15.0, here.ended)
     assert here.reports[-1].is_reached
     assert here.node.topics.namespaces_with("navigate_to_pose/_action/status") == []
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ({"robots": ()}, "there is nothing on this domain"),
+        ({"robots": ("tb1", "tb2/x")}, "there is one with --namespace tb1 or --namespace tb2/x"),
+        ({"robots": ("", "")}, "2 robots publish this odometry"),
+        ({"fault": "amcl"}, "another program publishes map → odom"),
+        ({"fault": "nan"}, "odometry has values that are not finite"),
+        ({"fault": "behind"}, "the robot's clock is more than 1 s behind"),
+        ({"fault": "simulated"}, "turn use_sim_time off"),
+    ],
+)
+def test_bad_input(
+    messages: tuple[str, Path], room: Callable[..., Room], more: dict[str, object], text: str
+) -> None:
+    """One clear line, and nothing moves."""
+    if messages[0] != "jazzy":
+        pytest.skip("one release is enough")
+    here = room(is_ready=False, **more)
+    assert here.run(20.0, lambda: any(text in line for line in here.printed)), here.printed
+    here.run(1.0)
+    here.goto()
+    here.run(1.0)
+    assert here.reports[-1].text.startswith("refused: ")
+    assert not any(robot.of("goal") for robot in here.robots)
+    assert sum(text in line for line in here.printed if not line.startswith("goal of")) == 1
 
 
 # ------------------------------------------------------------ as processes
