@@ -39,9 +39,11 @@ def robot() -> None:
     no ROS (docs/do/robot.md).
 
     \b
-    The agent:   share agent realsense --name bot --kind robot --edge … --poses udp://127.0.0.1:5570
-    The bridge:  share robot bridge --robot robot.yaml --allow-goals
-    A goal:      share robot goto 2.5 0.8
+    The agent:  share agent realsense --name bot --kind robot --edge tcp://H:P --poses udp://127.0.0.1:5570
+    The bridge: share robot bridge --robot robot.yaml --allow-goals
+
+    \b
+    Example:  share robot goto 2.5 0.8
     """
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from share.checks import checked_pose
 from share.errors import WireError, printable
+from share.files.json_file import parse_json
 from share.geometry.se3 import from_quat
 from share.robot.robot_events import AgentPoseReceived
 from share.types import F64, TrackState
@@ -23,8 +23,8 @@ _COVARIANCE_XY = 1
 def parse_pose_message(data: bytes) -> AgentPoseReceived:
     """Return the event. Raises WireError for what no agent sends."""
     try:
-        message = json.loads(data)
-    except (ValueError, RecursionError):
+        message = parse_json(data)
+    except ValueError:
         raise WireError("no JSON") from None
     if not isinstance(message, dict) or message.get("schema") != SCHEMA:
         raise WireError(f"not of schema {SCHEMA}; agent and bridge have to be of one release")

@@ -13,7 +13,7 @@ from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
 from share.geometry.se3 import from_rt, inverse, so3_exp
 from share.robot.area import DrivingArea
-from share.robot.grid import FloorGrid, area_grid, free_rectangle, read_grid
+from share.robot.grid import FloorMap, area_grid, free_rectangle, read_grid
 from share.robot.settings import CREATE3_SPEED_M_S, RobotSettings
 from share.types import F64
 
@@ -28,7 +28,7 @@ class RobotDescription:
     """What the file says: settings of the bridge, and the map to publish."""
 
     settings: RobotSettings
-    grid: FloorGrid = field(default_factory=lambda: free_rectangle(FREE_SQUARE_M))
+    grid: FloorMap = field(default_factory=lambda: free_rectangle(FREE_SQUARE_M))
 
 
 def read_robot(path: Path) -> RobotDescription:

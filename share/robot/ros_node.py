@@ -17,7 +17,7 @@ import numpy as np
 from share.errors import ShareError, UsageError, install_hint
 from share.geometry.se3 import quat_from_matrix
 from share.robot import robot_events as ev
-from share.robot.grid import FloorGrid
+from share.robot.grid import FloorMap
 from share.robot.planar import PlanarPose, yaw_of_quaternion
 from share.timing import PeriodicTimer
 from share.types import F64
@@ -156,7 +156,7 @@ class RosNode:
         )
         self._static.write(self._types.TFMessage([transform]))
 
-    def publish_grid(self, grid: FloorGrid) -> None:
+    def publish_grid(self, grid: FloorMap) -> None:
         """Publish the map for Nav2's static layer; latched."""
         types, stamp = self._types, self._types.ros_time(time.time_ns())
         origin = types.RosPose(

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from share.errors import ShareError, TransportError
+from share.files.json_file import parse_json
 from share.robot import robot_events as ev
 from share.timing import PeriodicTimer
 
@@ -111,7 +112,7 @@ class CommandServer:
         self, connection: _Connection, line: bytes, goal_id: Callable[[], bytes]
     ) -> ev.RobotEvent | None:
         try:
-            wish = json.loads(line)
+            wish = parse_json(line)
             match wish["do"]:
                 case "goto":
                     yaw, map_id = wish["yaw"], wish["map_id"]
@@ -189,4 +190,4 @@ def ask_bridge(path: Path, wish: dict[str, Any]) -> Iterator[dict[str, Any]]:
         link.sendall(json.dumps(wish).encode() + b"\n")
         with link.makefile("rb") as lines:
             for line in lines:
-                yield json.loads(line)
+                yield parse_json(line)

@@ -61,6 +61,16 @@ def test_a_map_of_map_saver(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "data", [b"", b"P5", b"P5 9 9 255\n12", b"P5 0 0 255\n", b"P2 1 1 255\n0", b"GIF89a"]
+)
+def test_a_map_whose_image_is_none(tmp_path, data):
+    (tmp_path / "room.pgm").write_bytes(data)
+    (tmp_path / "room.yaml").write_text("image: room.pgm\nresolution: 0.1\norigin: [0, 0, 0]\n")
+    with pytest.raises(ConfigError, match=r"room\.pgm"):
+        read(tmp_path, CAMERA + "map: room.yaml\n")
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         ("max_speed_m_s: 0.1\n", "give either 'camera'"),
