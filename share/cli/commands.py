@@ -79,6 +79,11 @@ COMMANDS = {
         "mocap",
         "Calibrate a motion capture's body and clock to a device.",
     ),
+    "robot": (
+        "share.cli.robot",
+        "robot",
+        "Let a ROS 2 robot drive by the shared map, and send it to places.",
+    ),
     "keys": ("share.cli.keys", "keys", "Manage the keys with which other machines connect to an edge."),
 }
 

@@ -1,7 +1,7 @@
 """The robot bridge as a state machine: poses and odometry in, `map → odom` and goals out.
 
-Nothing moves but by a goal that was allowed, in the map in which it was given, while the robot's place in it is
-known. What takes that away stops the robot, and a line says what it was.
+Nothing moves but by a goal that was allowed, in the map in which it was given, while the robot's place in
+it is known. What takes that away stops the robot, and a line says what it was.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from share.robot.planar import PlanarPose
 from share.robot.settings import RobotSettings
 from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
 
-LEAD_S = 0.2  # map → odom is valid so far ahead: tf2 does not extrapolate
+LEAD_S = 0.3  # map → odom is valid so far ahead: tf2 does not extrapolate
 PUBLISH_S = 0.02
 _TOO_FAST_S = 0.5
 _SPEED_MARGIN = 1.25  # of the limit: a controller overshoots
@@ -36,6 +36,7 @@ class RobotBridge:
         self._area_map = None if settings.area is None else settings.area.map_id
         self._publish_timer, self._speed_timer = PeriodicTimer(PUBLISH_S), PeriodicTimer(_SPEED_LIMIT_S)
         self._stamp_ns = 0  # of the last map → odom
+        self._published: PlanarPose | None = None
         self._edge_lost_ns: int | None = None
         self._too_fast_ns: int | None = None
         self._fault: str | None = ""  # what was said last; "" at the beginning
@@ -78,8 +79,14 @@ class RobotBridge:
         self._effects += self._goals.tick(now_ns)
         return self._effects
 
+    @property
+    def has_goal(self) -> bool:
+        """Whether a goal is under way, or being stopped."""
+        return self._goals.active is not None
+
     def report(self, now_ns: int) -> dict[str, Any]:
         """Return where the robot is and what it does, as plain data. Pose: x, y in m, yaw in rad."""
+        self._now_ns = now_ns
         place, goal, T = self._place, self._goals.active, self._place.T_map_base
         fault = self._present_fault()
         return {
@@ -130,7 +137,8 @@ class RobotBridge:
             self._stop(fault)
         elif (reason := self._stop_reason()) is not None:
             self._stop(reason)
-        if fault is None and self._publish_timer.fire_if_due(self._now_ns):
+        is_new = self._place.T_map_odom is not self._published
+        if fault is None and (is_new or self._publish_timer.fire_if_due(self._now_ns)):
             self._publish()
         if self._goals.active is not None and self._speed_timer.fire_if_due(self._now_ns):
             self._effects.append(ev.LimitSpeed(self._settings.max_speed_m_s))
@@ -145,6 +153,8 @@ class RobotBridge:
         assert robot_ns is not None and T_map_odom is not None
         # rising: the estimate of the robot's clock may step back by a millisecond
         self._stamp_ns = max(self._stamp_ns + 1, robot_ns + seconds_to_ns(LEAD_S))
+        self._published = T_map_odom
+        self._publish_timer.postpone(self._now_ns + seconds_to_ns(PUBLISH_S))
         self._effects.append(ev.PublishMapOdom(self._stamp_ns, T_map_odom))
 
     def _stop_reason(self) -> str | None:
@@ -195,11 +205,13 @@ class RobotBridge:
         here = self._place.T_map_base
         if not self._settings.allow_goals:
             return "goals are not allowed; start the bridge with --allow-goals once the robot's way is clear"
+        if (refusal := self._robot_refusal()) is not None:
+            return refusal
         if (fault := self._present_fault()) is not None or here is None:
             return fault or "the robot's place is not known"
         if self._goals.is_driven_by_others:
             return "another program has sent the robot a goal; let that end, or cancel it there"
-        return self._robot_refusal() or self._edge_refusal() or self._area_refusal(here, "the robot")
+        return self._edge_refusal() or self._area_refusal(here, "the robot")
 
     def _goal_refusal(self, event: ev.GotoRequested) -> str | None:
         """Return why this goal is not taken."""
@@ -215,12 +227,22 @@ class RobotBridge:
 
     def _robot_refusal(self) -> str | None:
         robot = self._robot
-        if robot is None or robot.servers == 0:
-            others = "" if robot is None else ", ".join(f"--namespace {one}" for one in robot.others)
-            hint = f"there is {others}" if others else "is Nav2 running, on this domain?"
+        if robot is None:
+            return "still looking for the robot"
+        if not robot.has_participants:
+            return (
+                "there is nothing on this domain; give the robot's --domain, or --peer ADDRESS where the "
+                "network has no multicast; a robot with a discovery server is invisible: "
+                "set it to simple discovery"
+            )
+        if robot.servers == 0:
+            others = " or ".join(f"--namespace {one}" for one in robot.others)
+            hint = f"there is one with {others}" if others else "is Nav2 running?"
             return f"no robot answers navigate_to_pose here; {hint}"
         if robot.servers > 1:
             return f"{robot.servers} robots answer navigate_to_pose here; give each its namespace"
+        if not robot.is_fast_dds:
+            return "the robot's Nav2 does not use Fast DDS; set RMW_IMPLEMENTATION=rmw_fastrtps_cpp there"
         return None
 
     def _edge_refusal(self) -> str | None:

@@ -39,7 +39,8 @@ class ActiveGoal:
 
 
 class GoalControl:
-    """Sends one goal, follows its status, and stops it. Each call returns effects. `active` is None between."""
+    """Sends one goal, follows its status, and stops it. Each call returns effects. `active` is None
+    between."""
 
     def __init__(self) -> None:
         self.active: ActiveGoal | None = None
@@ -153,7 +154,8 @@ class GoalControl:
         return effects
 
     def _cancel_orphans(self, statuses: dict[bytes, ev.GoalStatus], now_ns: int) -> list[ev.RobotEffect]:
-        """Cancel goals of SHARE that nobody follows: of a bridge that died, or given up for want of an answer."""
+        """Cancel goals of SHARE that nobody follows: of a bridge that died, or given up for want of an
+        answer."""
         own = None if self.active is None else self.active.goal_id
         orphans = [
             goal_id

@@ -35,8 +35,8 @@ class MapMoved:
 class MapOdom:
     """T_map_odom = T_map_base inv(T_odom_base(t)) at each pose's own time t, on the floor.
 
-    A pose waits until odometry on both sides of it has come. T_map_odom, map_id: of the newest pose; None before
-    the first, and after a loss.
+    A pose waits until odometry on both sides of it has come. T_map_odom, map_id: of the newest pose; None
+    before the first, and after a loss.
     """
 
     def __init__(self, settings: RobotSettings) -> None:
@@ -51,7 +51,7 @@ class MapOdom:
         self._odometry_ns: int | None = None  # arrival of the newest sample
         self._foreign_ns: int | None = None
         self._pose_fault: str | None = "no poses yet; is the agent running, with --poses to this address?"
-        self._odometry_fault: str | None = "no odometry yet"
+        self._odometry_fault: str | None = "no odometry yet; is the robot on, in this domain and namespace?"
         self._foreign = ""
 
     # ------------------------------------------------------------ in
@@ -84,7 +84,7 @@ class MapOdom:
         return self._resolve()
 
     def add_foreign(self, frame: str, now_ns: int) -> None:
-        """Another program publishes a transform from map to `frame`."""
+        """Another program publishes where odom is in `frame`."""
         self._foreign_ns, self._foreign = now_ns, frame
 
     def _is_late(self, sequence: int) -> bool:
@@ -131,7 +131,8 @@ class MapOdom:
         """Return why the robot's place in the map is not known; None if it is."""
         if self._foreign_ns is not None and now_ns - self._foreign_ns <= _FOREIGN_NS:
             return (
-                f"another program publishes map → {self._foreign}; turn AMCL, slam_toolbox or that bridge off"
+                f"another program publishes {self._foreign} → odom; "
+                "turn AMCL, slam_toolbox or that bridge off"
             )
         if self._odometry_fault is not None:
             return self._odometry_fault

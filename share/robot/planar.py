@@ -42,8 +42,8 @@ def wrapped(angle: float) -> float:
 
 
 def flattened(T: F64) -> PlanarPose:
-    """Return a pose (4, 4) in a frame whose z is up without its height and tilt: the yaw is the heading of its
-    x axis."""
+    """Return a pose (4, 4) in a frame whose z is up without its height and tilt: the yaw is the heading of
+    its x axis."""
     return PlanarPose(float(T[0, 3]), float(T[1, 3]), math.atan2(float(T[1, 0]), float(T[0, 0])))
 
 

@@ -18,9 +18,9 @@ from share.types import F64, TrackState
 class AgentPoseReceived:
     """A message of the agent's pose stream.
 
-    T_map_body (4, 4), map_id: None without a pose in the map. sigma_m: standard deviation of the position on the
-    floor; None if the agent does not know it. age_ns: of the frame; None if the agent does not say. has_edge:
-    whether the agent hears its edge; None if it does not say.
+    T_map_body (4, 4), map_id: None without a pose in the map. sigma_m: standard deviation of the position
+    on the floor; None if the agent does not know it. age_ns: of the frame; None if the agent does not say.
+    has_edge: whether the agent hears its edge; None if it does not say.
     """
 
     agent: str
@@ -46,7 +46,7 @@ class OdometryReceived:
 
 @dataclass(frozen=True)
 class ForeignMapFrame:
-    """Another program publishes `map → odom`. frame: the child frame."""
+    """Another program says where `odom` is. frame: in which frame."""
 
     frame: str
 
@@ -54,18 +54,21 @@ class ForeignMapFrame:
 @dataclass(frozen=True)
 class RobotDiscovered:
     """What is on the DDS domain: numbers of navigation servers and of publishers of odometry in the robot's
-    namespace; others: namespaces in which there is one of them. release: humble, jazzy, newer; "" unknown."""
+    namespace; others: other namespaces with a server. release: humble, jazzy, newer; "" unknown. is_fast_dds:
+    whether the servers use Fast DDS. has_participants: whether there is anybody on the domain."""
 
     servers: int
     odometry_publishers: int
     others: tuple[str, ...] = ()
     release: str = ""
+    is_fast_dds: bool = True
+    has_participants: bool = True
 
 
 @dataclass(frozen=True)
 class GotoRequested:
-    """A commander wants the robot at x, y (m, in the map). yaw: rad; None: as it arrives. map_id: in which map
-    the goal is meant; None: in the present one. goal_id (16 bytes): its name on the robot, used once."""
+    """A commander wants the robot at x, y (m, in the map). yaw: rad; None: as it arrives. map_id: in which
+    map the goal is meant; None: in the present one. goal_id (16 bytes): its name on the robot, used once."""
 
     commander: str
     goal_id: bytes

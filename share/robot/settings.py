@@ -14,9 +14,9 @@ CREATE3_SPEED_M_S = 0.306  # a Create 3's own limit
 
 @dataclass(frozen=True, eq=False)
 class RobotSettings:
-    """T_body_base (4, 4): takes coordinates in base_link to the agent's body. allow_goals: whether anything may
-    move. max_sigma_m: a position in the map that is less sure stops the robot. edge_silence_s: so long a goal
-    goes on without the edge. agent: whose poses; None: of the first that comes."""
+    """T_body_base (4, 4): takes coordinates in base_link to the agent's body. allow_goals: whether anything
+    may move. max_sigma_m: a position in the map that is less sure stops the robot. edge_silence_s: so long
+    a goal goes on without the edge. agent: whose poses; None: of the first that comes."""
 
     T_body_base: F64 = field(default_factory=lambda: np.eye(4))
     allow_goals: bool = False

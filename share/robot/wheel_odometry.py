@@ -16,8 +16,8 @@ _JUMP_M, _MAX_SPEED_M_S = 0.1, 1.5  # no robot gets further between two samples
 class WheelOdometry:
     """Samples of T_odom_base by rising stamp.
 
-    The robot's clock is ahead of the host's by at most the greatest (stamp - arrival): no sample arrives before
-    it was made. The quickest sample of the last seconds gives the clock to its own delay.
+    The robot's clock is ahead of the host's by at most the greatest (stamp - arrival): no sample arrives
+    before it was made. The quickest sample of the last seconds gives the clock to its own delay.
     """
 
     def __init__(self) -> None:
@@ -25,8 +25,8 @@ class WheelOdometry:
         self._ahead_ns: int | None = None
 
     def add(self, stamp_ns: int, arrived_ns: int, T_odom_base: PlanarPose) -> bool:
-        """Add a sample; one that comes late is ignored. Return False, and forget the others, if it cannot follow
-        them: odometry began anew."""
+        """Add a sample; one that comes late is ignored. Return False, and forget the others, if it cannot
+        follow them: odometry began anew."""
         follows = True
         if self._samples:
             last_ns, _, last = self._samples[-1]

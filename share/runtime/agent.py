@@ -299,7 +299,8 @@ class AgentRun:
                 self._ended = True
 
     def _publish_pose(self, localised: ev.LocalisedPose) -> None:
-        pose = localised_pose(localised, (time.monotonic_ns() - localised.arrived_ns) / 1e6)
+        age_ms = (time.monotonic_ns() - localised.arrived_ns) / 1e6
+        pose = localised_pose(localised, age_ms, self._state_machine.is_connected)
         for sink in self._pose_sinks:  # first: their delay matters
             sink.publish(pose)
         self._output_writer.submit(partial(self._files.write_odom_pose, pose.stamp_ns, pose.T_odom_body))

@@ -24,6 +24,7 @@ class Pose:
     (6, 6): of T_odom_body and T_map_body, rotation before translation, perturbed on the right, so about the
     body's axes. All four are None where the tracker does not know them. age_ms: from the frame's arrival
     until the pose was known; None where that is not measured.
+    is_connected: whether the agent hears its edge; None without one.
     """
 
     stamp_ns: int
@@ -37,6 +38,7 @@ class Pose:
     cov: F64 | None = None
     map_cov: F64 | None = None
     age_ms: float | None = None
+    is_connected: bool | None = None
 
     @property
     def position(self) -> F64:
@@ -75,8 +77,8 @@ def tracked_pose(stamp_ns: int, segment: int, result: TrackResult) -> Pose | Non
     )
 
 
-def localised_pose(localised: LocalisedPose, age_ms: float) -> Pose:
-    """Return an agent's pose, in the map too where it is known there."""
+def localised_pose(localised: LocalisedPose, age_ms: float, is_connected: bool) -> Pose:
+    """Return an agent's pose, in the map too where it is known there. is_connected: whether it hears its edge."""
     T_map_odom, map_id = localised.T_map_odom, localised.map_id
     pose = Pose(
         localised.stamp_ns,
@@ -87,6 +89,7 @@ def localised_pose(localised: LocalisedPose, age_ms: float) -> Pose:
         angular_velocity=localised.angular_velocity,
         cov=localised.cov,
         age_ms=age_ms,
+        is_connected=is_connected,
     )
     if T_map_odom is None or map_id is None:
         return pose

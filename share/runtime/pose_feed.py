@@ -75,7 +75,8 @@ class PoseMessages:
         odom = _pose_fields(pose.T_odom_body, pose.cov)
         odom |= {"velocity": _rounded(pose.velocity), "angular_velocity": _rounded(pose.angular_velocity)}
         in_map = None if pose.T_map_body is None else _pose_fields(pose.T_map_body, pose.map_cov)
-        return self._message(pose.stamp_ns, pose.state, pose.age_ms, pose.segment, odom, in_map, pose.map_id)
+        places = pose.segment, odom, in_map, pose.map_id
+        return self._message(pose.stamp_ns, pose.state, pose.age_ms, *places, pose.is_connected)
 
     def of_state(self, stamp_ns: int, state: TrackState, age_ms: float | None = None) -> str:
         """Return the message of a frame without a pose."""
@@ -90,6 +91,7 @@ class PoseMessages:
         odom: dict[str, Any] | None = None,
         in_map: dict[str, Any] | None = None,
         map_id: str | None = None,
+        is_connected: bool | None = None,
     ) -> str:
         message = {
             "schema": SCHEMA,
@@ -102,6 +104,7 @@ class PoseMessages:
             "odom": odom,
             "map": in_map,
             "map_id": map_id,
+            "edge": is_connected,
         }
         self._sequence += 1
         return json.dumps(message, separators=(",", ":"))

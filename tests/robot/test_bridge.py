@@ -109,7 +109,7 @@ def _forget_sigma(drive: RobotDrive) -> None:
 
 
 def _start_amcl(drive: RobotDrive) -> None:
-    drive.handle(ev.ForeignMapFrame("odom"))
+    drive.handle(ev.ForeignMapFrame("map"))
 
 
 def _break_odometry(drive: RobotDrive) -> None:
@@ -246,6 +246,8 @@ def test_no_goal_without_permission() -> None:
         (ev.RobotDiscovered(0, 1), "is Nav2 running"),
         (ev.RobotDiscovered(0, 1, ("tb2",)), "--namespace tb2"),
         (ev.RobotDiscovered(2, 1), "2 robots answer"),
+        (ev.RobotDiscovered(1, 1, is_fast_dds=False), "rmw_fastrtps_cpp"),
+        (ev.RobotDiscovered(0, 0, has_participants=False), "simple discovery"),
     ],
 )
 def test_no_goal_without_one_robot(drive: RobotDrive, robot: ev.RobotDiscovered, text: str) -> None:

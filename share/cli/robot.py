@@ -1,0 +1,227 @@
+"""`share robot`: let a ROS 2 robot drive by the shared map, and send it to places."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import degrees, radians
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.commands import CommandGroup
+from share.cli.terminal import LiveLine
+from share.errors import ShareError, UsageError
+
+if TYPE_CHECKING:
+    from share.net.udp import HostPort
+
+_domain = click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    envvar="ROS_DOMAIN_ID",
+    show_envvar=True,
+    default=0,
+    help="The robot's DDS domain.",
+)
+_namespace = click.option(
+    "--namespace", default="", metavar="NAME", help="The robot's namespace, such as tb1.  [default: none]"
+)
+
+
+@click.group(cls=CommandGroup, prefix="robot ")
+def robot() -> None:
+    """Let a ROS 2 robot drive by the shared map, and send it to places.
+
+    The bridge runs beside the robot's agent, on the same machine. It needs the extra share-slam[robot], and
+    no ROS (docs/do/robot.md).
+
+    \b
+    The agent:  share agent realsense --name bot --kind robot --edge tcp://H:P --poses udp://127.0.0.1:5570
+    The bridge: share robot bridge --robot robot.yaml --allow-goals
+
+    \b
+    Example:  share robot goto 2.5 0.8
+    """
+
+
+@robot.command(short_help="Publish the robot's place in the map, and pass goals on.")
+@click.option(
+    "--robot",
+    "robot_file",
+    metavar="FILE",
+    required=True,
+    type=options.PATH,
+    help="YAML file: where the camera sits, where and how fast the robot may drive (docs/do/robot.md).",
+)
+@click.option(
+    "--poses",
+    default="udp://127.0.0.1:5570",
+    metavar="udp://H:P",
+    help="Address to which the agent sends its poses, on this machine.",
+)
+@click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
+@click.option("--allow-goals", is_flag=True, help="Let the robot move. Without this no goal is passed on.")
+@_domain
+@_namespace
+@click.option(
+    "--peer",
+    "peers",
+    metavar="HOST",
+    multiple=True,
+    help="The robot's address, for a network without multicast. May be repeated.",
+)
+def bridge(
+    robot_file: Path,
+    poses: str,
+    agent: str | None,
+    allow_goals: bool,
+    domain: int,
+    namespace: str,
+    peers: tuple[str, ...],
+) -> None:
+    """Publish map → odom and /map for the robot's Nav2, and pass goals on to it, until Ctrl-C.
+
+    The robot moves only with --allow-goals, within the area and the speed of --robot, and while its place
+    in the map is known: a pose that is lost, older than 0.5 s or unsure cancels the goal and ends map → odom.
+
+    \b
+    Example:  share robot bridge --robot robot.yaml --allow-goals
+    """
+    from contextlib import closing
+
+    from share.net.udp import StampedSocket
+    from share.robot.robot_file import read_robot
+    from share.robot.ros_node import RosNode
+    from share.runtime.robot_bridge import RobotBridgeRun
+    from share.runtime.robot_commands import CommandServer, command_path
+    from share.runtime.signals import stop_on_signal
+
+    description = read_robot(robot_file)
+    settings = replace(description.settings, allow_goals=allow_goals, agent=agent)
+    live = LiveLine()
+
+    def print_line(text: str) -> None:
+        live.print_line(f"share robot: {text}")
+
+    with (
+        closing(StampedSocket.bind(_poses_address(poses))) as link,
+        closing(CommandServer(command_path(domain, namespace))) as commands,
+        closing(RosNode(domain, namespace, peers)) as node,
+    ):
+        run = RobotBridgeRun(replace(description, settings=settings), node, link, commands, print_line)
+        with stop_on_signal(run.stop):
+            moving = "goals are allowed" if allow_goals else "no goals (--allow-goals)"
+            print_line(f"domain {domain}, poses at {poses}, {moving}, at most {settings.max_speed_m_s:g} m/s")
+            run.run()
+    live.end()
+
+
+def _poses_address(text: str) -> HostPort:
+    """Return the address to listen on. Raises UsageError for one that others reach: a forged pose steers the
+    robot."""
+    from share.net.udp import parse_host
+    from share.runtime.pose_feed import DEFAULT_PORT, UDP
+
+    host = parse_host(text.removeprefix(UDP), DEFAULT_PORT, bind=True)
+    if host.name not in ("127.0.0.1", "::1"):
+        raise UsageError(
+            f"--poses {text}: poses that come over a network could be forged, and steer the robot; "
+            f"run the bridge on the agent's machine, with udp://127.0.0.1:{host.port}"
+        )
+    return host
+
+
+@robot.command(short_help="Send the robot to a place.", context_settings={"ignore_unknown_options": True})
+@click.argument("x", type=float)
+@click.argument("y", type=float)
+@click.argument("yaw", type=float, required=False)
+@click.option(
+    "--map-id", metavar="ID", help="Map in which the place is meant.  [default: the robot's present one]"
+)
+@_domain
+@_namespace
+@options.as_json
+def goto(
+    x: float, y: float, yaw: float | None, map_id: str | None, domain: int, namespace: str, as_json: bool
+) -> None:
+    """Send the robot to X Y, m in the map, and wait until it is there. Exit code 1 if it does not get there.
+
+    YAW is where it then looks, degrees counterclockwise from the map's x; without it, the way it came.
+    Ctrl-C stops the robot, as does the end of this command however it comes.
+
+    \b
+    Example:  share robot goto 2.5 -0.8 90
+    """
+    from share.runtime.robot_commands import ask_bridge, command_path
+
+    wish = {"do": "goto", "x": x, "y": y, "yaw": None if yaw is None else radians(yaw), "map_id": map_id}
+    live, last = LiveLine(), {"goal": "the bridge has ended", "is_reached": False}
+    for answer in ask_bridge(command_path(domain, namespace), wish):
+        last = answer
+        live.write(str(answer.get("goal")))
+        if answer.get("is_final"):
+            break
+    live.end()
+    text, is_reached = str(last["goal"]), bool(last.get("is_reached"))
+    if as_json:
+        click.echo(json.dumps({"reached": is_reached, "text": text}))
+    elif is_reached:
+        click.echo(text)
+    if not is_reached:
+        raise ShareError(f"the robot is not at x {x:g} y {y:g}: {text}")
+
+
+@robot.command(short_help="Stop the robot.")
+@_domain
+@_namespace
+def cancel(domain: int, namespace: str) -> None:
+    """Cancel the robot's goal, whoever gave it.
+
+    \b
+    Example:  share robot cancel
+    """
+    from share.runtime.robot_commands import ask_bridge, command_path
+
+    for answer in ask_bridge(command_path(domain, namespace), {"do": "cancel"}):
+        click.echo(answer.get("goal"))
+
+
+@robot.command(short_help="Show where the robot is and what it does.")
+@_domain
+@_namespace
+@options.as_json
+def watch(domain: int, namespace: str, as_json: bool) -> None:
+    """Show where the robot is and what it does, twice a second, until Ctrl-C. With --json, a line of JSON
+    each time.
+
+    \b
+    Example:  share robot watch
+    """
+    from share.runtime.robot_commands import ask_bridge, command_path
+
+    live = LiveLine()
+    for answer in ask_bridge(command_path(domain, namespace), {"do": "watch"}):
+        if as_json:
+            click.echo(json.dumps(answer))
+        elif "state" not in answer:
+            live.print_line(str(answer.get("line") or f"{answer.get('commander')}: {answer.get('goal')}"))
+        elif live.is_terminal:
+            live.write(_state_text(answer["state"]))
+        else:
+            live.print_line(_state_text(answer["state"]))
+    live.end()
+    raise ShareError("the bridge has ended")
+
+
+def _state_text(state: dict[str, Any]) -> str:
+    if state["pose"] is None:
+        return f"no place: {state['fault']}"
+    x, y, yaw = state["pose"]
+    where = f"x {x:.2f} y {y:.2f} m, {degrees(yaw):.0f}° in {state['map_id']}"
+    goal = state["goal"]
+    if goal is not None:
+        return f"{where}; to x {goal['x']:.2f} y {goal['y']:.2f} m for {goal['commander']}: {goal['status']}"
+    return where if state["refusal"] is None else f"{where}; no goals: {state['refusal']}"

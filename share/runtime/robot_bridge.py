@@ -1,0 +1,108 @@
+"""The robot bridge as a process: the agent's poses, the robot's DDS domain and commanders, in one loop.
+
+The state machine decides (`share.robot.bridge`); this carries its effects out.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from share.errors import WireError
+from share.geometry.se3 import inverse
+from share.net.udp import Datagram, StampedSocket
+from share.robot import robot_events as ev
+from share.robot.bridge import RobotBridge
+from share.robot.goal_control import GOAL_PREFIX
+from share.robot.pose_message import parse_pose_message
+from share.robot.robot_file import RobotDescription
+from share.robot.ros_node import RosNode
+from share.runtime.robot_commands import CommandServer
+from share.timing import LineLimiter
+
+_TICK_S = 0.01  # odometry waits so long at most
+_END_NS = 2_000_000_000
+_MAX_DATAGRAMS = 64  # in one step
+
+
+class RobotBridgeRun:
+    """One bridge until `stop`. print_line: takes lines for a person."""
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        node: RosNode,
+        poses: StampedSocket,
+        commands: CommandServer,
+        print_line: Callable[[str], None],
+    ) -> None:
+        self.bridge = RobotBridge(robot.settings)
+        self._node, self._poses, self._commands, self._print_line = node, poses, commands, print_line
+        self._line_limiter = LineLimiter()
+        self._is_stopped = False
+        node.publish_grid(robot.grid)
+        node.publish_body(inverse(robot.settings.T_body_base))
+
+    def stop(self) -> None:
+        """End the run; may be called by a signal handler."""
+        self._is_stopped = True
+
+    def run(self) -> None:
+        """Serve until stopped; then cancel the goal under way, and wait a moment until the robot confirms
+        it."""
+        while not self._is_stopped:
+            self.step(_TICK_S)
+        self._handle(ev.CancelRequested("the end of the bridge"))
+        end_ns = time.monotonic_ns() + _END_NS
+        while self.bridge.has_goal and time.monotonic_ns() < end_ns:
+            self.step(_TICK_S)
+
+    def step(self, wait_s: float) -> None:
+        """Wait for a pose, at most `wait_s`, and handle all that has come."""
+        datagram = self._poses.receive(wait_s)
+        for _ in range(_MAX_DATAGRAMS):
+            if datagram is None:
+                break
+            self._take_pose(datagram)
+            datagram = self._poses.receive(0)
+        for event in self._node.poll(time.monotonic_ns()):
+            self._handle(event)
+        for event in self._commands.poll(self._goal_id):
+            self._handle(event)
+        self._handle(ev.BridgeTick())
+        self._commands.show(lambda: self.bridge.report(time.monotonic_ns()), time.monotonic_ns())
+
+    def _goal_id(self) -> bytes:
+        return GOAL_PREFIX + secrets.token_bytes(16 - len(GOAL_PREFIX))
+
+    def _take_pose(self, datagram: Datagram) -> None:
+        try:
+            pose = parse_pose_message(datagram.data)
+        except WireError as error:
+            line = self._line_limiter.admit_new(f"what comes as a pose is none: {error}", time.monotonic_ns())
+            if line is not None:
+                self._print_line(line)
+            return
+        waited_ns = max(0, time.time_ns() - datagram.stamp_ns)
+        self._handle(replace(pose, age_ns=(pose.age_ns or 0) + waited_ns))
+
+    def _handle(self, event: ev.RobotEvent) -> None:
+        for effect in self.bridge.handle(event, time.monotonic_ns()):
+            match effect:
+                case ev.PublishMapOdom():
+                    self._node.publish_map_odom(effect.stamp_ns, effect.T_map_odom)
+                case ev.SendGoal():
+                    self._node.send_goal(effect)
+                case ev.CancelGoal():
+                    self._node.cancel_goal(effect.goal_id)
+                case ev.AskResult():
+                    self._node.ask_result(effect.goal_id)
+                case ev.LimitSpeed():
+                    self._node.limit_speed(effect.speed_m_s)
+                case ev.GoalReport():
+                    self._commands.report(effect)
+                case ev.BridgeLine():
+                    self._print_line(effect.text)
+                    self._commands.tell_watchers({"line": effect.text})

