@@ -132,7 +132,7 @@ class KeyframeLedger:
         entry.send_count += change
 
     def acknowledge(self, ack: Ack) -> bool:
-        """Apply an acknowledgement. Keyframes that later ones have overtaken are due again after GAP_RESEND_S.
+        """Apply an acknowledgement. Keyframes that later ones overtook are due again after GAP_RESEND_S.
 
         Return False, and ignore it, if it covers keyframes not sent in this session of the edge: it is of an
         earlier session, or false.
