@@ -132,7 +132,7 @@ class KeyframeLedger:
         entry.send_count += change
 
     def acknowledge(self, ack: Ack) -> bool:
-        """Apply an acknowledgement. Gaps below buffered keyframes are due again after GAP_RESEND_S.
+        """Apply an acknowledgement. Keyframes that later ones overtook are due again after GAP_RESEND_S.
 
         Return False, and ignore it, if it covers keyframes not sent in this session of the edge: it is of an
         earlier session, or false.
@@ -147,10 +147,19 @@ class KeyframeLedger:
         self._buffered_at_edge = frozenset(ack.buffered)
         if max_buffered in self._pending:  # it was in flight when this session began
             self._max_sent_id = max(self._max_sent_id, max_buffered)
-        for entry in self.pending[: self._window]:
-            if entry.attempts and entry.keyframe.id < max_buffered:
-                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds_to_ns(GAP_RESEND_S))
+        self._hasten_overtaken()
         return True
+
+    def _hasten_overtaken(self) -> None:
+        """Make each gap due soon: a keyframe that has not arrived though a later one, sent after it, has.
+
+        Once for each time that it is sent: an acknowledgement that is repeated says nothing new."""
+        arrived_ns: int | None = None  # when the newest of the later ones that have arrived was sent
+        for entry in reversed(self.pending[: self._window]):
+            if entry.keyframe.id in self._buffered_at_edge:
+                arrived_ns = max(entry.sent_ns, arrived_ns or entry.sent_ns)
+            elif entry.attempts and arrived_ns is not None and arrived_ns >= entry.sent_ns:
+                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds_to_ns(GAP_RESEND_S))
 
     def resume(self, welcome: Welcome) -> None:
         """Resume after the edge was silent: keyframes in flight count as lost and are due."""

@@ -70,8 +70,11 @@ def write_split(
     return path
 
 
-def write_ros1(path: Path, written: list[tuple[str, int, Any]], compression: str | None = None) -> Path:
+def write_ros1(
+    path: Path, written: list[tuple[str, int, Any]], compression: str | None = None, chunk_bytes: int = 2**20
+) -> Path:
     writer = Writer1(path)
+    writer.chunk_threshold = chunk_bytes
     if compression:
         writer.set_compression(getattr(Writer1.CompressionFormat, compression))
     with writer:

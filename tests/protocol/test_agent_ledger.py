@@ -225,6 +225,41 @@ def test_a_gap_is_resent_soon_and_buffered_keyframes_are_not() -> None:
     assert due(book, 9 * S) == []
 
 
+def test_an_edge_that_cannot_store_is_not_sent_the_same_again_and_again() -> None:
+    """Its disk is full: all that has arrived waits for it, and each duplicate is answered."""
+    book, sent = KeyframeLedger(100, window=4), []
+    new = entries(4)
+    for now in range(0, 30 * S, S // 20):
+        if new and now >= new[0].frame_index * S // 5:
+            book.add(new.pop(0))
+        for keyframe_id in due(book, now):
+            sent.append((now, keyframe_id))
+            arrived = sorted({one for _, one in sent})
+            book.acknowledge(Ack(0, tuple(arrived)))
+    assert [keyframe_id for _, keyframe_id in sent if keyframe_id] == [1, 2, 3]
+    assert np.diff([now for now, keyframe_id in sent if not keyframe_id]).tolist() == [
+        S,
+        2 * S,
+        4 * S,
+        8 * S,
+        8 * S,
+    ]
+
+
+def test_a_gap_that_does_not_close_is_resent_soon_once_for_what_has_arrived_since() -> None:
+    book = ledger(4, window=5)
+    due(book, 0)
+    lost, buffered = [], (1, 2, 3)
+    for now in range(S // 20, 20 * S, S // 20):
+        book.acknowledge(Ack(0, buffered))
+        if now == 5 * S:
+            book.add(entries(5)[4])  # it arrives: the second resend is lost too
+        for keyframe_id in due(book, now):
+            lost += [now] if keyframe_id == 0 else []
+            buffered = (*buffered, keyframe_id) if keyframe_id else buffered
+    assert np.diff(np.array([0, *lost]) / S).tolist() == pytest.approx([0.1, 2.0, 2.95, 8.0])
+
+
 def test_old_and_impossible_acknowledgements_are_ignored() -> None:
     book = ledger(8)
     due(book, 0)

@@ -14,6 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores
 
 from share.errors import DataError, ShareError, UsageError
+from share.recordings.bags import ros1_bag
 from share.recordings.calibration import kalibr_texts
 from share.recordings.mcap import ros_messages as ros
 from share.runtime.source import open_source
@@ -175,8 +176,38 @@ def test_flipped_bytes_of_a_ros1_bag_end_in_data_or_its_error(original, calib, t
 def test_a_chunk_that_unpacks_to_too_much_is_refused(original, calib, tmp_path, monkeypatch, soon):
     bag = FORMS["ros1-bz2"](tmp_path, messages(original))
     monkeypatch.setattr("share.recordings.bags.ros1_bag.MAX_CHUNK_BYTES", 1000)
-    with pytest.raises(DataError, match="a chunk unpacks to more than 1000 bytes"):
+    with pytest.raises(DataError, match=r"a chunk has more than 0\.001 MB"):
         list(open_source(str(bag), calib).measurements())
+
+
+def overlapping(original, path):
+    """A bag whose chunks overlap in time: every fifth message, then those that follow these, and so on."""
+    written = messages(original)
+    shuffled = [one for first in range(5) for one in written[first::5]]
+    return write_ros1(path / "walk.bag", shuffled, "BZ2", chunk_bytes=5_000)
+
+
+def test_chunks_that_overlap_in_time_are_unpacked_once_each(original, calib, tmp_path, monkeypatch):
+    """rosbags alone unpacks one for each message: 0.4 s each where a chunk has 120 MB of zeros."""
+    source = open_source(str(overlapping(original, tmp_path)), calib)
+    unpack, unpacked = ros1_bag._unpack, []
+
+    def counting(make, data):
+        unpacked.append(data)
+        return unpack(make, data)
+
+    monkeypatch.setattr(ros1_bag, "_unpack", counting)
+    images = [m for m in source.measurements() if m.stream != IMU]
+    assert len(images) == 12 and len(unpacked) == len(set(unpacked)) > 5
+    monkeypatch.undo()
+    assert samples(source) == samples(original)
+
+
+def test_chunks_that_overlap_too_much_are_refused(original, calib, tmp_path, monkeypatch):
+    source = open_source(str(overlapping(original, tmp_path)), calib)
+    monkeypatch.setattr(ros1_bag, "MAX_HELD_BYTES", 10_000)
+    with pytest.raises(DataError, match=r"walk\.bag: .*too many of its chunks overlap in time"):
+        list(source.measurements())
 
 
 def test_a_length_beyond_the_file_costs_no_memory(original, calib, tmp_path, soon):

@@ -1,27 +1,33 @@
 """Read an untrusted ROS 1 bag (`.bag`, format 2.0) by rosbags, its messages converted to ROS 2's CDR.
 
-rosbags unpacks chunks whatever they grow to and reads as much as a length says: here both are bounded.
+rosbags unpacks chunks whatever they grow to, reads as much as a length says, and where chunks overlap in time
+unpacks one for each message. Here sizes and lengths are bounded, and each chunk is unpacked once.
 """
 
 from __future__ import annotations
 
 import bz2
+import heapq
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cached_property, partial
+from io import SEEK_CUR, BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from share.errors import DataError
-from share.files.reading import open_regular, read_errors
+from share.files.reading import MB, open_regular, read_errors
 from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.mcap.file import MAX_CHUNK_BYTES, BoundedFile
+from share.recordings.mcap.file import MAX_CHUNK_BYTES, MAX_HELD_BYTES, BoundedFile
 from share.recordings.message_file import MessageFile, Messages, Topic
 from share.types import I64
+
+_MAX_SKIPPED = 16  # connection records before a message, which its index points to
+_MAX_HEADER_BYTES = 10_000  # of a record in a chunk: a topic's name is the longest part
 
 
 class Ros1Bag(MessageFile):
@@ -52,17 +58,17 @@ class Ros1Bag(MessageFile):
         if not channels:
             return
         with self._opened() as reader:
-            chosen = [one for one in reader.connections if one.id in channels]
-            for connection, stamp_ns, data in reader.messages(chosen, start_ns, end_ns):
+            kinds = {one.id: one.msgtype for one in reader.connections}
+            for stamp_ns, id, data in _stored_messages(reader, channels, start_ns, end_ns):
                 try:
-                    cdr = bytes(ros.typestore().ros1_to_cdr(data, connection.msgtype))
+                    cdr = bytes(ros.typestore().ros1_to_cdr(data, kinds[id]))
                 except _conversion_errors() as error:
-                    reason = f"{self.path}: {connection.topic} at {stamp_ns}: cannot be read ({error})"
+                    reason = f"{self.path}: {channels[id]} at {stamp_ns}: cannot be read ({error})"
                     if losses is None:
                         raise DataError(reason) from None
-                    losses.add(f"messages of {connection.topic}", str(stamp_ns), reason)
+                    losses.add(f"messages of {channels[id]}", str(stamp_ns), reason)
                 else:
-                    yield connection.topic, stamp_ns, cdr
+                    yield channels[id], stamp_ns, cdr
 
     @contextmanager
     def _opened(self) -> Iterator[Any]:
@@ -74,8 +80,7 @@ class Ros1Bag(MessageFile):
                 reader = Reader(_RegularFile(self.path))
                 reader.open()
                 with closing(reader):
-                    for place, chunk in reader.chunks.items():
-                        reader.chunks[place] = chunk._replace(decompressor=_bounded(chunk.decompressor))
+                    _check_places(reader.chunks.values())
                     yield reader
             except DataError:
                 raise
@@ -105,6 +110,82 @@ class _RegularFile:
         return str(self._path)
 
 
+def _stored_messages(
+    reader: Any, channels: Collection[int], start_ns: int, end_ns: int
+) -> Iterator[tuple[int, int, bytes]]:
+    """Yield log time ns, channel and data of the messages within [start_ns, end_ns), by time.
+
+    Raises ValueError where chunks overlap in time so much that more than MAX_HELD_BYTES wait for their turn.
+    """
+    wanted: dict[int, list[tuple[int, int, int]]] = {}  # time, offset, channel, by place of the chunk
+    for id in channels:
+        for time_ns, place, offset in reader.indexes.get(id, ()):
+            if start_ns <= time_ns < end_ns:
+                wanted.setdefault(place, []).append((time_ns, offset, id))
+    # chunks and messages by time, then by place in the file
+    waiting = [(min(entries)[0], place, -1, -1, b"") for place, entries in wanted.items()]
+    heapq.heapify(waiting)
+    held_bytes = 0
+    while waiting:
+        time_ns, place, offset, id, data = heapq.heappop(waiting)
+        if offset >= 0:
+            held_bytes -= len(data)
+            yield time_ns, id, data
+            continue
+        chunk = _read_chunk(reader, place)
+        for time_ns, offset, id in wanted.pop(place):
+            data = _message_data(chunk, offset, id, time_ns)
+            if (held_bytes := held_bytes + len(data)) > MAX_HELD_BYTES:
+                raise ValueError("too many of its chunks overlap in time")
+            heapq.heappush(waiting, (time_ns, place, offset, id, data))
+
+
+def _check_places(chunks: Iterable[Any]) -> None:
+    """Raise ValueError unless reading all chunks reads each byte of the file at most once."""
+    end = 0
+    for chunk in sorted(chunks, key=lambda chunk: int(chunk.datapos)):
+        if chunk.datapos < end:
+            raise ValueError("its index points to one chunk twice")
+        end = chunk.datapos + chunk.datasize
+
+
+def _read_chunk(reader: Any, place: int) -> BinaryIO:
+    """Return an unpacked chunk. Raises ValueError if it is too large."""
+    from rosbags.rosbag1.reader import read_bytes
+
+    chunk = reader.chunks[place]
+    _check_size(chunk.datasize)
+    reader.bio.seek(chunk.datapos)
+    return BytesIO(_bounded(chunk.decompressor)(read_bytes(reader.bio, chunk.datasize)))
+
+
+def _message_data(chunk: BinaryIO, offset: int, id: int, time_ns: int) -> bytes:
+    """Return the data of the message record at `offset`, or after the connection records there. Raises
+    ValueError if it is not the one that the index says."""
+    from rosbags.rosbag1.reader import RecordType, read_bytes, read_uint32
+
+    chunk.seek(offset)
+    for _ in range(_MAX_SKIPPED):
+        header = _record_header(chunk)
+        if header.get_uint8("op") != RecordType.CONNECTION:
+            break
+        chunk.seek(read_uint32(chunk), SEEK_CUR)
+    is_message = header.get_uint8("op") == RecordType.MSGDATA
+    if not is_message or (header.get_uint32("conn"), header.get_time("time")) != (id, time_ns):
+        raise ValueError("its index points to another message")
+    return bytes(read_bytes(chunk, read_uint32(chunk)))
+
+
+def _record_header(chunk: BinaryIO) -> Any:
+    """Return the header of the record here. Raises ValueError if it is too large."""
+    from rosbags.rosbag1.reader import Header, read_uint32
+
+    if (size := read_uint32(chunk)) > _MAX_HEADER_BYTES:
+        raise ValueError(f"the header of a record has {size} bytes")
+    chunk.seek(-4, SEEK_CUR)
+    return Header.read(chunk)
+
+
 def _bounded(decompressor: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     """Return a decompressor that gives at most MAX_CHUNK_BYTES. Raises ValueError beyond."""
     import lz4.frame  # type: ignore[import-untyped]
@@ -121,9 +202,13 @@ def _bounded(decompressor: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]
 
 def _unpack(make: Callable[[], Any], data: bytes) -> bytes:
     unpacked = make().decompress(data, max_length=MAX_CHUNK_BYTES + 1)
-    if len(unpacked) > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk unpacks to more than {MAX_CHUNK_BYTES} bytes")
+    _check_size(len(unpacked))
     return bytes(unpacked)
+
+
+def _check_size(chunk_bytes: int) -> None:
+    if chunk_bytes > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk has more than {MAX_CHUNK_BYTES / MB:g} MB")
 
 
 def _conversion_errors() -> tuple[type[Exception], ...]:
