@@ -128,7 +128,7 @@ def agent(
     options.print_notes(opened)
     hello = Hello(options.agent_name(name), agent_kind, run_id, opened.rig, streamed)
     errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
-    sinks = open_pose_sinks(poses, hello.name, origins)
+    sinks = open_pose_sinks(poses, hello.name, origins, live_line.print_line)
     run = AgentRun(
         opened,
         hello,

@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, urlencode
 
 from share.errors import UsageError
 from share.files.reading import open_regular
@@ -58,9 +58,10 @@ class HttpGuard:
             return HttpRefusal(HTTPStatus.FORBIDDEN, "only pages of this server may read it")
         if self._token is None:
             return None
-        path, query = urlsplit(target).path or "/", parse_qsl(urlsplit(target).query)
+        path, _, query_text = target.partition("?")
+        query = parse_qsl(query_text)
         if any(name == "token" and self._is_token(value) for name, value in query):  # off the address bar
-            rest = urlencode([pair for pair in query if pair[0] != "token"])
+            rest = urlencode([pair for pair in query if pair[0] != "token"], errors="replace")
             where = f"Location: {_own_path(path)}{'?' if rest else ''}{rest}"
             return HttpRefusal(
                 HTTPStatus.SEE_OTHER, "go on without the token", (where, *self.cookie_headers())
@@ -81,12 +82,12 @@ class HttpGuard:
 
     def _is_token(self, value: str) -> bool:
         assert self._token is not None
-        return hmac.compare_digest(value.encode(), self._token.encode())
+        return _are_equal(value, self._token)
 
     def _has_cookie(self, cookies: str) -> bool:
         pairs = (pair.strip().partition("=") for pair in cookies.split(";"))
         values = [value for name, _, value in pairs if name == self._cookie_name]
-        return any(hmac.compare_digest(value.encode(), self._cookie.encode()) for value in values)
+        return any(_are_equal(value, self._cookie) for value in values)
 
     def _is_authorised(self, authorization: str) -> bool:
         scheme, _, value = authorization.partition(" ")
@@ -99,6 +100,11 @@ class HttpGuard:
         except (binascii.Error, UnicodeDecodeError, ValueError):
             return False
         return self._is_token(password)
+
+
+def _are_equal(given: str, secret: str) -> bool:
+    """given: from a request, with whatever bytes it had."""
+    return hmac.compare_digest(given.encode(errors="surrogatepass"), secret.encode())
 
 
 def _own_path(path: str) -> str:

@@ -6,14 +6,16 @@ not resent. By WebSocket to all that connect: each gets the newest message that 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
 import re
 import socket
-import struct
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +28,14 @@ from share.runtime.pose import Pose, PoseSink
 from share.types import F64, TrackState
 
 if TYPE_CHECKING:
-    from websockets.sync.server import ServerConnection
+    from websockets.asyncio.server import ServerConnection
 
 SCHEMA = 3  # 3: velocity, covariances; all keys of 2 are as they were
 DEFAULT_PORT = 5570
 UDP, WEBSOCKET = "udp://", "ws://"
 _DIGITS = 9  # 1 nm
 _UPPER = np.triu_indices(6)
+_LOCAL_ORIGIN = r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"
 _ROS_ORDER = [3, 4, 5, 0, 1, 2]  # translation before rotation
 
 
@@ -110,10 +113,19 @@ class PoseMessages:
         return json.dumps(message, separators=(",", ":"))
 
 
-def open_pose_sinks(addresses: Sequence[str], agent: str, origins: Sequence[str] = ()) -> list[PoseSink]:
+def _print_error(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def open_pose_sinks(
+    addresses: Sequence[str],
+    agent: str,
+    origins: Sequence[str] = (),
+    notify: Callable[[str], None] = _print_error,
+) -> list[PoseSink]:
     """Return what sends poses by UDP to each udp:// address, or serves them at each ws:// one.
 
-    origins: web pages that may read the latter. Raises UsageError, ShareError without the extra for
+    origins: web pages that may read the latter. notify: as in `PoseWebSocket`. Raises UsageError, ShareError without the extra for
     WebSocket, TransportError if a port is in use.
     """
     if origins and not any(address.startswith(WEBSOCKET) for address in addresses):
@@ -121,7 +133,7 @@ def open_pose_sinks(addresses: Sequence[str], agent: str, origins: Sequence[str]
     sinks: list[PoseSink] = []
     try:
         for address in addresses:
-            sinks.append(_open_pose_sink(address, agent, origins))
+            sinks.append(_open_pose_sink(address, agent, origins, notify))
     except ShareError:
         for sink in sinks:
             sink.close()
@@ -129,12 +141,12 @@ def open_pose_sinks(addresses: Sequence[str], agent: str, origins: Sequence[str]
     return sinks
 
 
-def _open_pose_sink(address: str, agent: str, origins: Sequence[str]) -> PoseSink:
+def _open_pose_sink(
+    address: str, agent: str, origins: Sequence[str], notify: Callable[[str], None]
+) -> PoseSink:
     if not address.startswith(WEBSOCKET):
         return PoseFeed(address, agent)
-    from share.runtime.pose_feed import PoseWebSocket
-
-    return PoseWebSocket(address, agent, origins)
+    return PoseWebSocket(address, agent, origins, notify)
 
 
 def _pose_fields(T: F64, cov: F64 | None) -> dict[str, Any]:
@@ -165,25 +177,37 @@ def _rounded(vector: F64 | None) -> list[float] | None:
 
 MAX_READERS = 16  # at once; more are refused
 _MAX_RECEIVED_BYTES = 1024  # of a message from a reader, which none needs to send
+_MAX_WAITING = 32  # connections that are not served yet
+_BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
 _CLOSE_S = 1.0
-_SEND_TIMEOUT = struct.pack("@ll", 5, 0)  # s, us: after that a reader that does not read is disconnected
-_TRY_LATER = 1013  # RFC 6455, section 11.7
+_SEND_S = 5.0  # after that a reader that does not read is disconnected
+_LOOK_S = 1.0  # between looks for readers that have gone, where there is no news
+_UNSENT_BYTES = 4096  # of a reader that does not read; newer messages are left out
+_SLEEP_RATIO = 9.0  # the server's thread uses at most a tenth of a core
 
 
 class PoseWebSocket:
     """Serves poses by WebSocket (RFC 6455) at ws://HOST:PORT until closed, for web pages and engines.
 
-    A thread for each reader sends the newest message and leaves out those that it has no time for, so a slow
-    or silent reader delays neither the agent nor another reader.
+    One thread serves all. It sends the newest message to each reader and leaves out those that it has no time
+    for, so a slow or silent reader delays neither the agent nor another reader; one that sends more than a few
+    messages a second is disconnected.
 
     origins: web pages that may read them, such as https://app.example; others are refused, except those of
-    this machine (localhost). A program that is no browser sends none and may. Raises UsageError, ShareError
-    without the package, TransportError if the port is in use.
+    this machine (localhost). A program that is no browser sends none and may. notify: called once with a line,
+    from the server's thread, if this process has no file descriptors left for readers. Raises UsageError,
+    ShareError without the package, TransportError if the port is in use.
     """
 
-    def __init__(self, address: str, agent: str, origins: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        address: str,
+        agent: str,
+        origins: Sequence[str] = (),
+        notify: Callable[[str], None] = _print_error,
+    ) -> None:
         try:
-            from websockets.sync.server import serve
+            from share.net.bounded_websocket import Door, ModestSelector, PeerLimits
         except ImportError:
             raise ShareError(install_hint("websockets", "websocket")) from None
         if bad := [one for one in origins if not re.fullmatch(r"https?://[^/\s]+", one)]:
@@ -192,23 +216,22 @@ class PoseWebSocket:
             )
         host = parse_host(address.removeprefix(WEBSOCKET), DEFAULT_PORT, bind=True)
         self._messages = PoseMessages(agent)
-        self._changed, self._newest, self._number = threading.Condition(), "", 0
-        self._is_closed, self._readers = False, set[Any]()
-        allowed = [None, re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"), *origins]
+        self._newest = 0, ""  # number and text
+        self._is_closed, self._is_short_told, self._readers = False, False, set[Any]()
+        self._allowed: list[Any] = [None, re.compile(_LOCAL_ORIGIN), *origins]
+        self._notify = notify
+        family = socket.AF_INET6 if ":" in host.name else socket.AF_INET
         try:
-            self._server = serve(
-                self._serve_reader,
-                host.name,
-                host.port,
-                origins=allowed,
-                compression=None,
-                max_size=_MAX_RECEIVED_BYTES,
-                logger=_silent_logger(),
-            )
+            self._listener = socket.create_server((host.name, host.port), family=family)
         except OSError as error:
             raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
-        self.host = HostPort(host.name, int(self._server.socket.getsockname()[1]))
-        self._thread = threading.Thread(target=self._server.serve_forever, name="poses", daemon=True)
+        self.host = HostPort(host.name, int(self._listener.getsockname()[1]))
+        # a page's request has some kB; a reader then sends an answer to a ping now and then
+        self._door = Door(PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10))
+        self._loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
+        self._loop.set_exception_handler(self._take_loop_error)
+        self._news = asyncio.Event()  # replaced at each message
+        self._thread = threading.Thread(target=self._run, name="poses", daemon=True)
         self._thread.start()
 
     def publish(self, pose: Pose) -> None:
@@ -219,45 +242,102 @@ class PoseWebSocket:
 
     def close(self) -> None:
         """Disconnect all readers and free the port."""
-        with self._changed:
-            self._is_closed = True
-            self._changed.notify_all()
-            readers = list(self._readers)
-        self._server.shutdown()
-        for reader in readers:  # one that does not read would hold its thread up
-            with contextlib.suppress(OSError):
-                reader.socket.shutdown(socket.SHUT_RDWR)
-        self._thread.join(timeout=_CLOSE_S)
+        self._is_closed = True
+        self._wake()
+        self._thread.join(timeout=3 * _CLOSE_S)
 
     def _show(self, text: str) -> None:
-        with self._changed:
-            self._newest, self._number = text, self._number + 1
-            self._changed.notify_all()
+        self._newest = self._newest[0] + 1, text
+        if self._readers:
+            self._wake()
 
-    def _serve_reader(self, connection: ServerConnection) -> None:
-        """Send the newest message again and again, in this reader's own thread, until either end closes."""
-        from websockets.exceptions import ConnectionClosed
+    def _wake(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._tell_news)
 
-        connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT)
-        with self._changed:
-            sent, is_welcome = self._number, len(self._readers) < MAX_READERS
-            self._readers.add(connection)
+    # ------------------------------------------------------------------ the server's thread
+
+    def _run(self) -> None:
         try:
-            if not is_welcome:
-                connection.close(_TRY_LATER, f"{MAX_READERS} readers already")
-            with contextlib.suppress(ConnectionClosed, OSError):
-                while is_welcome and (message := self._next_message(sent)) is not None:
-                    text, sent = message
-                    connection.send(text)
+            self._loop.run_until_complete(self._serve())
         finally:
-            with self._changed:
-                self._readers.discard(connection)
+            self._loop.close()
+            self._listener.close()
 
-    def _next_message(self, sent: int) -> tuple[str, int] | None:
-        """Return the newest message and its number, once it is newer than number `sent`; None at the end."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._number > sent or self._is_closed)
-            return None if self._is_closed else (self._newest, self._number)
+    async def _serve(self) -> None:
+        from websockets.asyncio.server import serve
+
+        from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection
+
+        server = await serve(
+            self._serve_reader,
+            sock=self._listener,
+            backlog=BACKLOG,
+            origins=self._allowed,
+            compression=None,
+            max_size=_MAX_RECEIVED_BYTES,
+            write_limit=_UNSENT_BYTES,
+            open_timeout=HANDSHAKE_S,
+            close_timeout=_CLOSE_S,
+            process_request=self._refuse_excess,
+            create_connection=partial(BoundedConnection, door=self._door),  # type: ignore[arg-type]
+            logger=_silent_logger(),
+        )
+        self._listener.listen(_BACKLOG)
+        while not self._is_closed:
+            await self._news.wait()
+        server.close()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_CLOSE_S):
+                await server.wait_closed()
+        self._door.abort_all()
+        await server.wait_closed()
+
+    def _tell_news(self) -> None:
+        self._news.set()
+        if not self._is_closed:
+            self._news = asyncio.Event()
+
+    def _refuse_excess(self, connection: Any, _request: Any) -> Any:
+        if self._door.admit(connection):
+            return None
+        return connection.respond(503, f"{MAX_READERS} readers already\n")
+
+    async def _serve_reader(self, connection: ServerConnection) -> None:
+        """Send the newest message again and again until either end closes."""
+        from websockets.exceptions import ConnectionClosed
+        from websockets.protocol import State
+
+        self._readers.add(connection)
+        sent, _ = self._newest
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                while not self._is_closed and connection.state is State.OPEN:
+                    if self._newest[0] == sent:
+                        await self._wait_for_news()
+                        continue
+                    sent, text = self._newest
+                    async with asyncio.timeout(_SEND_S):
+                        await connection.send(text)
+        except TimeoutError:
+            connection.transport.abort()
+        finally:
+            self._readers.discard(connection)
+
+    async def _wait_for_news(self) -> None:
+        """Wait for a message, but not so long that a reader that has gone is kept."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_LOOK_S):
+                await self._news.wait()
+
+    def _take_loop_error(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Say once that there are no file descriptors left; the loop goes on accepting after a second."""
+        if isinstance(context.get("exception"), OSError) and not self._is_short_told:
+            self._is_short_told = True
+            self._notify(
+                f"poses at ws://{self.host}: no new reader for now: {context['exception'].strerror}; "
+                "raise `ulimit -n`, or close what is open"
+            )
 
 
 def _silent_logger() -> logging.Logger:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import resource
 import select
 import socket
 import threading
@@ -15,7 +17,7 @@ import pytest
 
 from share.errors import ShareError
 from share.runtime.pose import Pose
-from share.runtime.pose_feed import open_pose_sinks
+from share.runtime.pose_feed import MAX_READERS, PoseWebSocket, open_pose_sinks
 from share.types import TrackState
 
 client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
@@ -56,7 +58,7 @@ def test_each_reader_gets_each_pose(served):
 
 def small_socket(sink) -> socket.socket:
     """A connected socket that holds 4 kB, and so does the server's end of it."""
-    sink._server.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+    sink._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
     made = socket.socket()
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     made.connect((sink.host.name, sink.host.port))
@@ -66,9 +68,9 @@ def small_socket(sink) -> socket.socket:
 def test_a_reader_that_does_not_read_costs_nothing(served):
     """Its socket is full after some messages; publishing goes on, and the newest comes last."""
     with connected(served, sock=small_socket(served), max_queue=1, close_timeout=0.1):
-        (silent,) = served._readers
+        (silent,) = (one.transport.get_extra_info("socket") for one in served._readers)
         end, stamp_ns = time.monotonic() + 20, 0
-        while select.select([], [silent.socket], [], 0.1)[1]:  # until there is no room in it any more
+        while select.select([], [silent], [], 0.1)[1]:  # until there is no room in it any more
             assert time.monotonic() < end
             served.publish(pose(stamp_ns := stamp_ns + 1))
         longest_s = 0.0
@@ -109,6 +111,77 @@ def test_what_is_no_websocket_is_no_trouble(served, capfd):
         served.publish(pose(7))
         assert json.loads(reader.recv(timeout=5))["stamp_ns"] == 7
     assert capfd.readouterr() == ("", "")
+
+
+def gets_poses(served, connection) -> bool:
+    served.publish(pose(7))
+    return json.loads(connection.recv(timeout=5))["stamp_ns"] == 7
+
+
+def test_idle_connections_make_no_thread_and_keep_nobody_out(served):
+    threads = threading.active_count()
+    with contextlib.ExitStack() as stack:
+        for _ in range(300):
+            stack.enter_context(socket.create_connection((served.host.name, served.host.port)))
+        assert threading.active_count() == threads
+        with connected(served) as reader:
+            assert gets_poses(served, reader)
+        assert len(served._door._waiting) <= 32
+
+
+def test_too_many_readers_are_refused_before_they_are_served(served):
+    with contextlib.ExitStack() as stack:
+        for _ in range(MAX_READERS):
+            stack.enter_context(connected(served))
+        with pytest.raises(exceptions.InvalidStatus, match="503"):
+            client.connect(f"ws://{served.host}", proxy=None)
+        assert served._door.open_count == MAX_READERS
+    with connected(served) as reader:  # the places are free again
+        assert gets_poses(served, reader)
+
+
+@pytest.mark.parametrize("frame", [b"\x89\x80\0\0\0\0", b"\x81\x80\0\0\0\0"], ids=["ping", "text"])
+def test_a_reader_that_sends_a_lot_is_disconnected(served, frame):
+    """PING frames took a third of the tracker's time each; the answers to them too."""
+    with connected(served) as other, connected(served) as loud:
+        loud.socket.sendall(frame * 200)
+        served.publish(pose(7))
+        with pytest.raises(exceptions.ConnectionClosed):
+            for _ in range(2):
+                loud.recv(timeout=5)
+        assert json.loads(other.recv(timeout=5))["stamp_ns"] == 7
+
+
+def test_a_reader_that_sends_now_and_then_stays(served):
+    with connected(served) as reader:
+        for _ in range(5):
+            assert reader.ping().wait(5)
+        assert gets_poses(served, reader)
+
+
+def test_without_file_descriptors_it_says_so_once_and_goes_on():
+    told: list[str] = []
+    server = PoseWebSocket("ws://127.0.0.1:0", "ann", (), told.append)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.closing(server), contextlib.ExitStack() as stack:
+        probe = socket.socket()
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, before)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (probe.fileno() + 20, before[1]))
+        filling = []
+        with contextlib.suppress(OSError):
+            while True:
+                filling.append(os.dup(0))
+        probe.connect((server.host.name, server.host.port))
+        end = time.monotonic() + 10
+        while not told and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(1.2)  # it tries again
+        for fd in filling:
+            os.close(fd)
+        probe.close()
+        with connected(server) as reader:
+            assert gets_poses(server, reader)
+    assert len(told) == 1 and "Too many open files; raise `ulimit -n`" in told[0]
 
 
 @pytest.mark.long
