@@ -131,7 +131,7 @@ def test_no_arguments_prints_help_with_exit_code_2(capsys):
         ("xyz", "no command 'xyz'; commands: demo, capture, track, agent, edge, dataset"),
         ("--bogus", "No such option '--bogus'"),
         ("dataset inf", "no command 'inf'; did you mean 'info'?"),
-        ("evaluate ate", "no command 'ate'; commands: run, score, ablation, sweep, compare"),
+        ("evaluate ate", "no command 'ate'; commands: run, score, ablation, sweep, paper, compare"),
         ("track", "Missing argument 'SOURCE'"),
         ("track x y", "unexpected extra argument (y)"),
         ("track x --ot y", "No such option '--ot'. (Did you mean one of: '--mode', '--out'"),
