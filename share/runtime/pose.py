@@ -78,7 +78,10 @@ def tracked_pose(stamp_ns: int, segment: int, result: TrackResult) -> Pose | Non
 
 
 def localised_pose(localised: LocalisedPose, age_ms: float, is_connected: bool) -> Pose:
-    """Return an agent's pose, in the map too where it is known there. is_connected: whether it hears its edge."""
+    """Return an agent's pose, in the map too where it is known there.
+
+    is_connected: whether it hears its edge.
+    """
     T_map_odom, map_id = localised.T_map_odom, localised.map_id
     pose = Pose(
         localised.stamp_ns,

@@ -406,13 +406,11 @@ class Commands:
         """Start a bridge and wait until it takes goals."""
         poses = f"udp://127.0.0.1:{self.port}"
         bridge = self.start("bridge", "--robot", str(self.file), "--allow-goals", "--poses", poses)
+        end = time.time() + 20
+        while not (self.tmp_path / f"share-robot-{self.domain}.sock").exists():
+            assert bridge.poll() is None and time.time() < end
+            time.sleep(0.05)
         watch = self.start("watch", "--json")
-        for _ in range(100):
-            if (self.tmp_path / f"share-robot-{self.domain}.sock").exists() and watch.poll() is None:
-                break
-            time.sleep(0.1)
-            if watch.poll() is not None:
-                watch = self.start("watch", "--json")
         assert watch.stdout is not None
         for line in watch.stdout:
             state = json.loads(line).get("state")

@@ -90,7 +90,20 @@ def test_the_longest_datagram_fits_one_packet(app):
     feed = PoseFeed(where(app), "ä" * 64)
     T = from_rt(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([-1000.123456789] * 3))
     cov = np.full((6, 6), -1.2345e-10)
-    long = 2**62, TrackState.INERTIAL_ONLY, T, T, "b" * 96, 10**6, -1234.567891 * V, -V, cov, cov, 12345.678, False
+    long = (
+        2**62,
+        TrackState.INERTIAL_ONLY,
+        T,
+        T,
+        "b" * 96,
+        10**6,
+        -1234.567891 * V,
+        -V,
+        cov,
+        cov,
+        12345.678,
+        False,
+    )
     feed.publish(Pose(*long))
     assert len(app.recv(4000)) < 1472
     feed.close()
