@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from unicodedata import category, normalize
 
-from share.types import MAX_NAME_LENGTH
+from share.types import MAX_NAME_LENGTH, MAX_RUN_KEY_LENGTH
 
 NAME_RULE = f"1 to {MAX_NAME_LENGTH} letters, digits, '-_.+@#()' and single spaces between them"
 _PUNCTUATION = "-_.+@#()"
@@ -23,8 +23,18 @@ def checked_name(name: str) -> str:
     """Return `name` composed (NFC), so that names with the same accents are equal.
 
     Raises ValueError, whose text does not quote it, if the name is not allowed."""
-    name = normalize("NFC", name)
-    if not 0 < len(name) <= MAX_NAME_LENGTH:
+    return _checked(normalize("NFC", name), MAX_NAME_LENGTH)
+
+
+def checked_run_key(key: str) -> str:
+    """Return a run's key: an agent's name with some digits. Raises ValueError if it is none."""
+    if normalize("NFC", key) != key:
+        raise ValueError("key of a run: is not composed")
+    return _checked(key, MAX_RUN_KEY_LENGTH)
+
+
+def _checked(name: str, max_length: int) -> str:
+    if not 0 < len(name) <= max_length:
         raise ValueError(f"name: {len(name)} characters; use {NAME_RULE}")
     previous = " "  # class of the previous character, with its marks
     for character in name:

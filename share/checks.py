@@ -12,6 +12,7 @@ MAX_POSITION_M = 1e5  # m, of a position or a landmark
 MAX_ODOM_M = 1e4  # m from the odometry origin; map poses, composed of several, stay below MAX_POSITION_M
 MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
 MAX_SIGMA = 1e6  # of any quantity, in its unit
+MAX_MAP_ID_LENGTH = 96  # characters: a run's key has up to 81, a segment's number up to 11
 MAX_STAMP_NS = 2**62  # either side of 0: 146 years; differences fit 64 bits
 
 
@@ -54,6 +55,14 @@ def checked_id(name: str, value: int, minimum: int = 0) -> int:
     if not minimum <= value <= MAX_ID:
         raise ValueError(f"{name}: {value} is outside {minimum} .. {MAX_ID}")
     return value
+
+
+def checked_map_id(map_id: str) -> str:
+    """Return the name of a map, which comes from a peer or a file. Raises ValueError unless it is 1 to
+    MAX_MAP_ID_LENGTH printable characters."""
+    if not (0 < len(map_id) <= MAX_MAP_ID_LENGTH and map_id.isprintable()):
+        raise ValueError(f"map_id: 1 to {MAX_MAP_ID_LENGTH} printable characters")
+    return map_id
 
 
 def checked_stamp(name: str, value: int) -> int:

@@ -21,6 +21,7 @@ from share.checks import (
     checked_array,
     checked_cov,
     checked_id,
+    checked_map_id,
     checked_pose,
     checked_sigma,
     checked_stamp,
@@ -38,7 +39,7 @@ DESCRIPTOR_BYTES = 32  # ORB: 256 bits
 # Limits, checked on construction; see also `share.checks`.
 MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME_LENGTH = 64  # characters, of an agent's name
-MAX_MAP_ID_LENGTH = MAX_NAME_LENGTH + 32  # a run key has up to 17 characters more, a segment number up to 11
+MAX_RUN_KEY_LENGTH = MAX_NAME_LENGTH + 17
 MAX_JPEG_BYTES = 64_000  # of a keyframe's image
 MAX_SURFACES = 256  # in a keyframe's image; a tracker has some 80
 MAX_PLANE = 1e3  # 1/m, of each component of a surface's plane: 1 mm from the camera
@@ -386,8 +387,7 @@ class Correction:
     answered_keyframe: int = -1
 
     def __post_init__(self) -> None:
-        if not (0 < len(self.map_id) <= MAX_MAP_ID_LENGTH and self.map_id.isprintable()):
-            raise ValueError(f"map_id: 1 to {MAX_MAP_ID_LENGTH} printable characters")
+        checked_map_id(self.map_id)
         checked_id("revision", self.revision)
         checked_id("segment_keyframe", self.segment_keyframe)
         checked_id("answered_keyframe", self.answered_keyframe, minimum=-1)

@@ -98,13 +98,13 @@ def _write_folders(scenes: list[Scene], out: Path, kind: str, bar: Callable[[int
     from share.files.writing import new_folder
     from share.recordings.exports.colmap import write_colmap
     from share.recordings.exports.kitti import write_kitti
+    from share.recordings.exports.names import map_folders
 
     write = write_colmap if kind == "colmap" else write_kitti
     with new_folder(out) as work:
+        folders = map_folders(work, [scene.name for scene in scenes])
         for scene in scenes:
-            folder = work if len(scenes) == 1 else work / scene.name.replace("/", ".")
-            folder.mkdir(exist_ok=True)
-            write(scene, folder, bar)
+            write(scene, folders[scene.name], bar)
 
 
 def _check_suffix(out: Path, kind: str) -> None:

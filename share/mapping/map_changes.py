@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from share.checks import checked_array, checked_cov, checked_pose
+from share.checks import checked_array, checked_cov, checked_map_id, checked_pose
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64, Keyframe
@@ -146,6 +146,8 @@ class SavePoses:
         n = len(self.keys)
         if len(self.map_ids) != n:
             raise ValueError(f"map_ids: {len(self.map_ids)} names for {n} keyframes")
+        for map_id in set(self.map_ids):
+            checked_map_id(map_id)
         object.__setattr__(
             self, "T_map_body", checked_array("T_map_body", self.T_map_body, (n, 4, 4), np.float64)
         )

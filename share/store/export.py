@@ -18,6 +18,7 @@ from share.files.writing import atomic_write, new_folder, open_new, write_errors
 from share.geometry import se3
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
+from share.recordings.exports.names import distinct_file_names, map_folders
 from share.recordings.exports.scene import known_points
 from share.recordings.trajectory import Trajectory, format_tum
 from share.store.map_store import MapStore
@@ -63,10 +64,9 @@ def _write_all(stored_map: StoredMap, work: Path, progress: Callable[[int], None
     by_map: dict[str, list[StoredKeyframe]] = {}
     for keyframe in stored_map.keyframes:
         by_map.setdefault(poses[keyframe.keyframe_key][0], []).append(keyframe)
-    done = {}
+    done, folders = {}, map_folders(work, list(by_map))
     for name, keyframes in by_map.items():
-        folder = work if len(by_map) == 1 else work / name.replace("/", ".")
-        folder.mkdir(exist_ok=True)
+        folder = folders[name]
         T = {k.keyframe_key: poses[k.keyframe_key][1] for k in keyframes}
         loops = [x for x in stored_map.loops if x.a in T and x.b in T]
         _write_loops(folder / "loops.csv", loops)
@@ -83,11 +83,12 @@ def _write_trajectories(
     by_run: dict[str, list[StoredKeyframe]] = {}
     for keyframe in keyframes:
         by_run.setdefault(keyframe.run_key, []).append(keyframe)
+    files = distinct_file_names(names[run] for run in by_run)
     for run, own in by_run.items():
         own.sort(key=lambda k: k.keyframe.stamp_ns)
         stamps = np.array([k.keyframe.stamp_ns for k in own], np.int64)
         text = format_tum(Trajectory(stamps, np.array([T[k.keyframe_key] for k in own])))
-        atomic_write(folder / f"{names[run]}.tum", text)
+        atomic_write(folder / f"{files[names[run]]}.tum", text)
     return tuple(names[run] for run in by_run)
 
 

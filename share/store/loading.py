@@ -198,6 +198,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     )
     known_keys = {k.keyframe_key for k in repaired.keyframes}
     connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)
+    segments, lost_segments = _decode_rows(read_rows, "stretch", rows.read_segment)
     complaints = [
         _loss_line(read_rows, "about", read_rows.lost_counts["about"], _ABOUT_LOST),
         _loss_line(read_rows, "run", lost_runs, "agent runs could not be read"),
@@ -207,12 +208,12 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _loss_line(read_rows, "link", lost_links, "odometry edges could not be read"),
         _loss_line(read_rows, "loop", lost_loops, "loops could not be read"),
         _loss_line(read_rows, "", len(loops) - len(connected_loops), "loops led to lost keyframes"),
-        _loss_line(read_rows, "stretch", read_rows.lost_counts["stretch"], "segments could not be read"),
+        _loss_line(read_rows, "stretch", lost_segments, "segments could not be read"),
         _loss_line(read_rows, "poses", lost_poses, _SOLUTIONS_LOST),
     ]
     return StoredMap(
         tuple(runs.values()),
-        _segment_names(read_rows, repaired.keyframes),
+        tuple(dict.fromkeys((*segments, *(k.segment_name for k in repaired.keyframes)))),
         repaired.keyframes,
         repaired.links,
         connected_loops,
@@ -246,11 +247,6 @@ def _decode_rows(read_rows: ReadRows, table: str, decode: Callable[[Row], Any]) 
     if version_error is not None and not out:
         raise version_error
     return out, lost_count
-
-
-def _segment_names(read_rows: ReadRows, keyframes: Sequence[StoredKeyframe]) -> tuple[str, ...]:
-    named = [rows.segment_name(*row) for _, row in read_rows.tables["stretch"]]
-    return tuple(dict.fromkeys((*named, *(k.segment_name for k in keyframes))))
 
 
 def _next_ids(next_ids: dict[str, int], keyframes: Sequence[StoredKeyframe]) -> dict[str, int]:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from share.agent_names import checked_run_key
 from share.checks import checked_cov, checked_id, checked_pose
 from share.errors import StoreError
 from share.mapping.loops import KeyframeKey, Loop
@@ -118,7 +119,7 @@ def poses_row(poses: SavePoses) -> Row:
 def read_run(row: Row) -> SaveRun:
     key, next_id, version, hello = row
     checked_id("next", _checked_int(next_id))
-    return SaveRun(_checked_text(key), _decode_message(messages.Hello, version, hello))
+    return SaveRun(checked_run_key(_checked_text(key)), _decode_message(messages.Hello, version, hello))
 
 
 def read_credentials(about: list[tuple[int, Row]]) -> dict[str, str]:
@@ -139,6 +140,12 @@ def read_keyframe(row: Row) -> StoredKeyframe:
     if decoded.id != id:
         raise ValueError(f"the message of keyframe {agent}:{id} has id {decoded.id}")
     return StoredKeyframe(_checked_text(agent), decoded, segment_name(agent, segment), ordinal)
+
+
+def read_segment(row: Row) -> str:
+    """Return the name of a segment."""
+    run, nth = row
+    return segment_name(checked_run_key(_checked_text(run)), checked_id("nth", _checked_int(nth)))
 
 
 def segment_name(run: str, nth: int) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from share.checks import MAX_STAMP_NS, checked_id, checked_stamp
+from share.checks import MAX_MAP_ID_LENGTH, MAX_STAMP_NS, checked_id, checked_stamp
 from share.earlier_poses import MAX_SPANS, EarlierPoses
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
@@ -30,7 +30,6 @@ from share.types import (
     MAX_GYRO_RAD_S,
     MAX_JPEG_BYTES,
     MAX_KEYPOINTS,
-    MAX_MAP_ID_LENGTH,
     MAX_NAME_LENGTH,
     MAX_SURFACES,
     AgentKind,

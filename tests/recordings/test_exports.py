@@ -18,8 +18,9 @@ from share.geometry.camera import Camera, ImuNoise, Rig
 from share.recordings.exports.colmap import write_colmap
 from share.recordings.exports.kitti import write_kitti
 from share.recordings.exports.mcap_scene import write_mcap
+from share.recordings.exports.names import plain_names
 from share.recordings.exports.rerun_file import write_rerun
-from share.recordings.exports.scene import Scene, SceneAgent, SceneView, plain_names
+from share.recordings.exports.scene import Scene, SceneAgent, SceneView
 from share.recordings.trajectory import Trajectory
 from share.runtime.source import open_source
 

@@ -1,6 +1,7 @@
 """What others' programs open: trajectories, points and pictures of a recording, a run or a map.
 
 scene           what is exported, whatever it comes from
+names           names of files, folders, topics and frames
 kitti           poses of cam0
 colmap          a COLMAP text model, for structure from motion and Gaussian splatting
 mcap_scene      ROS 2 messages, for Foxglove and RViz

@@ -15,7 +15,8 @@ from share.errors import DataError, UsageError
 from share.files.writing import open_new, write_errors
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.recordings.exports.scene import Progress, Scene, SceneView, plain_names
+from share.recordings.exports.names import plain_names
+from share.recordings.exports.scene import Progress, Scene, SceneView
 from share.types import F64
 from share.vision.image_codec import decode_gray, image_header
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from share.files.writing import atomic_write
 from share.geometry import se3
-from share.recordings.exports.scene import Progress, Scene, plain_names
+from share.recordings.exports.names import plain_names
+from share.recordings.exports.scene import Progress, Scene
 
 
 def write_kitti(scene: Scene, folder: Path, progress: Progress) -> None:

@@ -22,7 +22,8 @@ from share.files.writing import new_file, write_errors
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.recordings.convert import intact_measurements
-from share.recordings.exports.scene import Progress, Scene, SceneAgent, plain_names
+from share.recordings.exports.names import plain_names
+from share.recordings.exports.scene import Progress, Scene, SceneAgent
 from share.recordings.images import EncodedImage
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.message_writer import MessageWriter

@@ -16,7 +16,8 @@ from share.errors import ShareError, install_hint
 from share.files.writing import check_replaceable
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.recordings.exports.scene import Progress, Scene, SceneAgent, SceneView, plain_names
+from share.recordings.exports.names import plain_names
+from share.recordings.exports.scene import Progress, Scene, SceneAgent, SceneView
 from share.types import F64
 
 _TIMELINE = "stamp"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -68,17 +67,3 @@ class Scene:
 def known_points(points: F32) -> F64:
     """Return the rows of (N, 3) without NaN."""
     return points[~np.isnan(points).any(axis=1)].astype(np.float64)
-
-
-def plain_names(names: Sequence[str]) -> dict[str, str]:
-    """Return a distinct name for each that is allowed in a file name, a ROS topic and a frame: letters,
-    digits and underscores, not beginning with a digit."""
-    out: dict[str, str] = {}
-    for name in names:
-        plain = base = re.sub(r"[^A-Za-z0-9_]", "_", name if not name[:1].isdigit() else f"_{name}") or "_"
-        number = 1
-        while plain in out.values():
-            number += 1
-            plain = f"{base}_{number}"
-        out[name] = plain
-    return out
