@@ -23,7 +23,15 @@ from share.config import Config
 from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.library.background import BackgroundRun
-from share.library.checked_input import image_samples, imu_sample
+from share.library.checked_input import (
+    checked_call,
+    checked_config,
+    checked_kind,
+    checked_path,
+    checked_rate_hz,
+    image_samples,
+    imu_sample,
+)
 from share.library.recording import RecordedFrames, open_recording
 from share.net.keys import agent_keys
 from share.net.transport import check_keys, connect, parse_address
@@ -69,18 +77,24 @@ class AgentThread(BackgroundRun):
         images, Hz. edge: its address, tcp://HOST:PORT. kind: ar or robot. keys, server_key, poses, out: as
         of `share agent`. notify: called from the agent's threads with lines for a person. Raises ShareError.
         """
-        if not is_agent_name(name):
+        if not is_agent_name(checked_kind("name", name, str, "text")):
             raise UsageError(f"name {name[:80]!r}: use {AGENT_NAME_RULE}")
-        if kind not in set(AgentKind):
+        if kind not in list(AgentKind):
             raise UsageError(f"kind {kind!r:.40}: use ar (headset) or robot")
         if keys is not None and server_key is None:
             raise UsageError("keys needs server_key, the public key of the edge")
-        settings, run_id = config or Config(), secrets.randbits(63)
+        checked_call("notify", notify)
+        if poses is not None:
+            checked_kind("poses", poses, str, "text")
+        settings, run_id = checked_config(config), secrets.randbits(63)
+        folder = None if keys is None else checked_path("keys", keys)
         edge_keys = (
-            None if server_key is None else agent_keys(None if keys is None else Path(keys), server_key)
+            None
+            if server_key is None
+            else agent_keys(folder, checked_kind("server_key", server_key, str, "text"))
         )
-        check_keys(parse_address(edge), edge_keys)
-        self._camera = OwnCamera(source, rate_hz) if isinstance(source, Rig) else None
+        check_keys(parse_address(checked_kind("edge", edge, str, "text")), edge_keys)
+        self._camera = OwnCamera(source, checked_rate_hz(rate_hz)) if isinstance(source, Rig) else None
         self.pose: Pose | None = None
         self.state = TrackState.INITIALISING
         self._waiting: queue.Queue[Pose | None] = queue.Queue(MAX_WAITING_POSES)
@@ -89,7 +103,7 @@ class AgentThread(BackgroundRun):
         check_trackable(self._source.name, self._source.rig)
         self._hello = Hello(name, AgentKind(kind), run_id, self._source.rig)
         self._settings, self._notify, self._poses = settings, notify, [] if poses is None else [poses]
-        self._out = None if out is None else Path(out)
+        self._out = None if out is None else checked_path("out", out)
         self._connect = partial(connect, edge, run_id, edge_keys)
         self._run: AgentRun | None = None  # once started
         self._thread = threading.Thread(target=self._run_to_end, name=f"agent {name}", daemon=True)
@@ -122,6 +136,8 @@ class AgentThread(BackgroundRun):
 
     def start(self) -> None:
         """Begin, once. Returns at once. Raises ShareError if `out` or `poses` cannot be used."""
+        if self._run is not None:
+            raise UsageError("this agent was started before; make another for another run")
         settings, notify = self._settings, self._notify
         with contextlib.ExitStack() as stack:
             sinks = open_pose_sinks(self._poses, self._hello.name)

@@ -13,6 +13,7 @@ from typing import Any
 from share.config import POLICY_NAMES, STREAMED, Config, with_policy
 from share.errors import UsageError
 from share.library.background import BackgroundRun
+from share.library.checked_input import checked_call, checked_config, checked_kind, checked_path
 from share.net.keys import edge_keys_for
 from share.net.transport import bind, parse_address
 from share.runtime.edge import EdgeRun
@@ -48,7 +49,7 @@ class EdgeThread(BackgroundRun):
             raise UsageError(
                 'start an edge under `if __name__ == "__main__":`; its mapper imports this program'
             )
-        settings = config or Config()
+        settings = checked_config(config)
         if policy is not None:
             if policy not in POLICY_NAMES:
                 raise UsageError(f"policy {policy!r:.40} is not known; known: {', '.join(POLICY_NAMES)}")
@@ -57,8 +58,11 @@ class EdgeThread(BackgroundRun):
         if is_streamed and map_file is not None:
             raise UsageError("map_file: policy streamed builds no map; leave it out, or take another policy")
         own_keys = edge_keys_for(
-            None if keys is None else Path(keys), parse_address(address, bind=True).local
+            None if keys is None else checked_path("keys", keys),
+            parse_address(checked_kind("address", address, str, "text"), bind=True).local,
         )
+        own_out = None if out is None else checked_path("out", out)
+        checked_call("on_event", on_event)
         self._error: BaseException | None = None
         self._report: dict[str, Any] = {}
         with contextlib.ExitStack() as stack:
@@ -67,14 +71,17 @@ class EdgeThread(BackgroundRun):
             self.endpoint = link.endpoint
             store = None
             if map_file is not None:
-                store = stack.enter_context(contextlib.closing(MapStore.open(Path(map_file))))
-            self._run = EdgeRun(settings, link, None if out is None else Path(out), on_event, store)
+                store = MapStore.open(checked_path("map_file", map_file))
+                stack.callback(store.close)
+            self._run = EdgeRun(settings, link, own_out, on_event, store)
             stack.callback(self._run.close)
             self._resources = stack.pop_all()
         self._thread = threading.Thread(target=self._run_to_end, name="edge", daemon=True)
 
     def start(self) -> None:
-        """Begin to answer agents. Returns at once."""
+        """Begin to answer agents, once. Returns at once. Raises ShareError the second time."""
+        if self._thread.ident is not None:
+            raise UsageError("this edge was started before; make another for another run")
         self._thread.start()
 
     def stop(self) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from share.config import Config
 from share.geometry.camera import Rig
+from share.library.checked_input import checked_config, checked_frames, checked_path
 from share.recordings.trajectory import Trajectory
 from share.runtime.pipeline import read_frames
 from share.runtime.source import open_source, read_given_calibration
@@ -25,7 +26,8 @@ class RecordedFrames:
     """
 
     def __init__(self, path: str | Path, calib: str | Path | None, frames: slice | None, config: Config):
-        self.source = open_source(str(path), None if calib is None else str(calib), frames)
+        given = None if calib is None else str(checked_path("calib", calib))
+        self.source = open_source(str(checked_path("path", path)), given, checked_frames(frames))
         self._config = config
 
     @property
@@ -67,12 +69,12 @@ def open_recording(
     calib: Kalibr's camchain file or a folder with both chains, in place of the recording's own calibration.
     frames: read only these of cam0's images, such as slice(0, 100). Raises ShareError.
     """
-    return RecordedFrames(path, calib, frames, config or Config())
+    return RecordedFrames(path, calib, frames, checked_config(config))
 
 
 def load_calibration(path: str | Path) -> Rig:
     """Return the rig of a Kalibr camchain file, of a folder with both of Kalibr's chains, or of a camera.yaml
     (docs/lookup/data.md). Without an IMU chain the rig has no IMU. Raises ShareError."""
-    calibration = read_given_calibration(str(path))
+    calibration = read_given_calibration(str(checked_path("path", path)))
     assert calibration is not None
     return calibration.rig

@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from share.config import Config
 from share.errors import UsageError
 from share.geometry.camera import Rig
-from share.library.checked_input import check_frame, image_samples, imu_sample
+from share.library.checked_input import (
+    check_frame,
+    checked_config,
+    checked_kind,
+    checked_rate_hz,
+    image_samples,
+    imu_sample,
+)
 from share.recordings.images import decode_frame
 from share.runtime.error_estimators import NoErrorEstimate
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
@@ -35,10 +42,11 @@ class Tracker:
     """
 
     def __init__(self, rig: Rig, config: Config | None = None, rate_hz: float = 0.0) -> None:
-        """rate_hz: of cam0's images, by which missing ones are noticed; 0: unknown. Raises ShareError if no
-        tracker fits the rig."""
-        check_trackable("rig", rig)
-        settings = config or Config()
+        """rate_hz: of cam0's images, by which missing ones are noticed; 0: unknown. Raises ShareError,
+        also if no tracker fits the rig."""
+        check_trackable("rig", checked_kind("rig", rig, Rig, "a Rig"))
+        settings = checked_config(config)
+        rate_hz = checked_rate_hz(rate_hz, may_be_unknown=True)
         self.rig = rig
         self.state = TrackState.INITIALISING
         self.waiting_for: WaitReason | None = None

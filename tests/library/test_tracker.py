@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.recordings import make_euroc
 
-from share import Frame, ShareError, Tracker, load_calibration, open_recording
+from share import Agent, Edge, Frame, ShareError, Tracker, load_calibration, open_recording
 from share.geometry.se3 import exp, inverse, log
 from share.recordings.trajectory import read_tum
 
@@ -143,6 +143,80 @@ def test_samples_that_are_none_are_refused():
         tracker.feed_images(-1, GRAY, GRAY)
     with pytest.raises(ShareError, match="the rig has no IMU"):
         Tracker(rig().without_imu()).feed_imu(1, [0, 0, 0], [0, 0, 9.81])
+
+
+def repr_of(value):
+    """An id of a parameter: pytest cannot write a number of 5000 digits."""
+    return type(value).__name__
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["abc", ["a", "b", "c"], ["1", "2", "3"], [[1], [2, 3], 4], [1j, 0, 0], [object()] * 3, None, {1, 2, 3},
+     [10**400, 0, 0], [10**5000, 0, 0], [True] * 3, {"x": 1}],
+    ids=repr_of,
+)  # fmt: skip
+def test_numbers_that_are_none_are_refused_in_one_line(value):
+    for name, samples in (("gyro", (value, [0, 0, 9.81])), ("accel", ([0, 0, 0], value))):
+        with pytest.raises(ShareError, match=rf"^{name}: .*expected three") as caught:
+            Tracker(rig()).feed_imu(1, *samples)
+        assert len(str(caught.value)) < 200 and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("stamp", [10**400, 10**5000, "1", None, np.array([5]), 1e9], ids=repr_of)
+def test_stamps_that_are_none_are_refused(stamp):
+    with pytest.raises(ShareError, match=r"^stamp_ns: .{,80}give nanoseconds"):
+        Tracker(rig()).feed_imu(stamp, [0, 0, 0], [0, 0, 9.81])
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [float("nan"), float("inf"), -1, 1e-300, 1e300, 10**400, 10**5000, "30", None, [30], 30j, True],
+    ids=repr_of,
+)
+def test_rates_that_no_camera_has_are_refused(rate):
+    for make in (lambda: Tracker(rig(), rate_hz=rate), lambda: Agent(rig(), "ann", EDGE, rate_hz=rate)):
+        with pytest.raises(ShareError, match=r"^rate_hz: .* is outside 0\.1 \.\. 1000 Hz"):
+            make()
+
+
+def test_rates_of_numpy_and_an_unknown_one_are_accepted():
+    for rate in (0, 0.0, np.float32(0), np.float32(30), np.int64(30), 30):
+        Tracker(rig(), rate_hz=rate)
+
+
+EDGE = "tcp://127.0.0.1:5999"
+WRONG = {
+    "a rig": lambda: Tracker(None),
+    "settings": lambda: Tracker(rig(), config={"a": 1}),
+    "a frame": lambda: Tracker(rig()).track(GRAY),
+    "its samples": lambda: Tracker(rig()).track(Frame(1, 0, GRAY, GRAY, imu=None)),
+    "a path": lambda: open_recording(None),
+    "a long name": lambda: open_recording("x" * 5000),
+    "a NUL": lambda: load_calibration("\0"),
+    "frames": lambda: open_recording("x", frames=5),
+    "frames of text": lambda: open_recording("x", frames=slice("a")),
+    "no step": lambda: open_recording("x", frames=slice(None, None, 0)),
+    "a name": lambda: Agent(rig(), None, EDGE),
+    "an edge": lambda: Agent(rig(), "ann", 5),
+    "a kind": lambda: Agent(rig(), "ann", EDGE, ["ar"]),
+    "keys": lambda: Agent(rig(), "ann", EDGE, keys="\0", server_key="x"),
+    "poses": lambda: Agent(rig(), "ann", EDGE, poses=["udp://127.0.0.1:5"]),
+    "a folder": lambda: Agent(rig(), "ann", EDGE, out="\0"),
+    "a function": lambda: Agent(rig(), "ann", EDGE, notify=5),
+    "an address": lambda: Edge(None),
+    "a policy": lambda: Edge(EDGE, policy=["share"]),
+    "a map": lambda: Edge("tcp://127.0.0.1:0", map_file="\0"),
+    "its folder": lambda: Edge("tcp://127.0.0.1:0", out=5),
+    "its function": lambda: Edge("tcp://127.0.0.1:0", on_event=5),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_arguments_of_another_kind_are_a_share_error_of_one_line(what):
+    with pytest.raises(ShareError) as caught:
+        WRONG[what]()
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 300
 
 
 def test_frames_must_come_in_order():
