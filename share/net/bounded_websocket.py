@@ -84,7 +84,7 @@ class Allowance:
         return self._left >= 0
 
 
-class BoundedConnection(ServerConnection):
+class BoundedConnection(ServerConnection):  # type: ignore[misc]
     """A connection through a door. Given as `create_connection=partial(BoundedConnection, door=door)`."""
 
     def __init__(self, *args: Any, door: Door, **options: Any) -> None:

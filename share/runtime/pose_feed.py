@@ -277,7 +277,7 @@ class PoseWebSocket:
             open_timeout=HANDSHAKE_S,
             close_timeout=_CLOSE_S,
             process_request=self._refuse_excess,
-            create_connection=partial(BoundedConnection, door=self._door),  # type: ignore[arg-type]
+            create_connection=partial(BoundedConnection, door=self._door),
             logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)

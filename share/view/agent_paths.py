@@ -6,6 +6,7 @@ chunks that have to be drawn again.
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,6 +76,7 @@ class RunPath:
         self.is_current = True  # the edge hears from it, and it is not lost
         self._pose: PoseShown | None = None
         self._count = 0
+        self._ids: list[int] = []  # of keyframes, in order
         self._segment_begin = 0  # first keyframe of the present segment
         self._path: dict[int, list[_PathPoint]] = {}
         self._last_position: F64 | None = None  # of the path, in the map
@@ -89,6 +91,7 @@ class RunPath:
         )
         self._count += 1
         self.keyframes[one.id] = one
+        insort(self._ids, one.id)
         self.chunks.setdefault(one.chunk, []).append(one)
         if self.T_map_odom is not None and self.map_id is not None:
             one.place(self.map_id, self.T_map_odom @ one.T_odom_body, False)
@@ -101,7 +104,7 @@ class RunPath:
             return []
         is_other_map = map_id != self.map_id
         self.map_id, self.T_map_odom = map_id, T_map_odom
-        present = (one for one in self.keyframes.values() if one.id >= self._segment_begin)
+        present = (self.keyframes[k] for k in self._ids[bisect_left(self._ids, self._segment_begin) :])
         return [
             one
             for one in present
@@ -113,23 +116,26 @@ class RunPath:
         if (gone := self.keyframes.pop(id_, None)) is None:
             return None
         self.chunks[gone.chunk].remove(gone)
-        heir = max((k for k in self.keyframes if k < id_), default=min(self.keyframes, default=None))
-        for chunk in gone.path_chunks:
-            points = self._path.get(chunk, [])
+        at = bisect_left(self._ids, id_)
+        del self._ids[at]
+        heir = self._ids[max(0, at - 1)] if self._ids else None
+        for chunk in gone.path_chunks & self._path.keys():
             self._path[chunk] = [
                 moved
-                for point in points
-                if (moved := self._inherited(point, gone, heir) if point.keyframe == id_ else point)
+                for point in self._path[chunk]
+                if (moved := self._inherited(point, gone, heir, chunk) if point.keyframe == id_ else point)
                 is not None
             ]
         return gone
 
-    def _inherited(self, point: _PathPoint, gone: PlacedKeyframe, heir: int | None) -> _PathPoint | None:
+    def _inherited(
+        self, point: _PathPoint, gone: PlacedKeyframe, heir: int | None, chunk: int
+    ) -> _PathPoint | None:
         """Return a point of a removed keyframe in another one; None if they are not in one map."""
         kept = None if heir is None else self.keyframes[heir]
         if kept is None or kept.T_map_body is None or gone.T_map_body is None or kept.map_id != gone.map_id:
             return None
-        kept.path_chunks |= gone.path_chunks
+        kept.path_chunks.add(chunk)
         T_kept_gone = inverse(kept.T_map_body) @ gone.T_map_body
         return _PathPoint(kept.id, T_kept_gone[:3, :3] @ point.position + T_kept_gone[:3, 3])
 
@@ -145,7 +151,7 @@ class RunPath:
         if self._last_position is not None and np.linalg.norm(position - self._last_position) < _PATH_STEP_M:
             return None
         self._last_position = position
-        chunk = max(self._path, default=0)
+        chunk = next(reversed(self._path), 0)
         if len(self._path.get(chunk, ())) >= PATH_POINTS_PER_CHUNK:
             chunk += 1
             self._path[chunk] = self._path[chunk - 1][-1:]  # joined to the chunk before
@@ -158,7 +164,7 @@ class RunPath:
         """Forget the oldest chunk of a path that is too long. Return it."""
         if len(self._path) <= _MAX_PATH_CHUNKS:
             return None
-        oldest = min(self._path)
+        oldest = next(iter(self._path))
         del self._path[oldest]
         return oldest
 
