@@ -63,6 +63,13 @@ class _PathPoint:
     position: F64
 
 
+def _relative(one: PlacedKeyframe, other: PlacedKeyframe) -> F64 | None:
+    """Return T_one_other; None if they are not in one map."""
+    if one.T_map_body is None or other.T_map_body is None or one.map_id != other.map_id:
+        return None
+    return inverse(one.T_map_body) @ other.T_map_body
+
+
 class RunPath:
     """One run. number: names it in drawings."""
 
@@ -118,26 +125,27 @@ class RunPath:
         self.chunks[gone.chunk].remove(gone)
         at = bisect_left(self._ids, id_)
         del self._ids[at]
-        heir = self._ids[max(0, at - 1)] if self._ids else None
+        heir = self.keyframes[self._ids[max(0, at - 1)]] if self._ids else None
+        T_heir_gone = None if heir is None else _relative(heir, gone)
         for chunk in gone.path_chunks & self._path.keys():
+            points = self._path[chunk]
+            if heir is None or T_heir_gone is None:
+                self._path[chunk] = [point for point in points if point.keyframe != id_]
+                continue
+            heir.path_chunks.add(chunk)
+            R, t = T_heir_gone[:3, :3], T_heir_gone[:3, 3]
             self._path[chunk] = [
-                moved
-                for point in self._path[chunk]
-                if (moved := self._inherited(point, gone, heir, chunk) if point.keyframe == id_ else point)
-                is not None
+                _PathPoint(heir.id, R @ point.position + t) if point.keyframe == id_ else point
+                for point in points
             ]
         return gone
 
-    def _inherited(
-        self, point: _PathPoint, gone: PlacedKeyframe, heir: int | None, chunk: int
-    ) -> _PathPoint | None:
-        """Return a point of a removed keyframe in another one; None if they are not in one map."""
-        kept = None if heir is None else self.keyframes[heir]
-        if kept is None or kept.T_map_body is None or gone.T_map_body is None or kept.map_id != gone.map_id:
-            return None
-        kept.path_chunks.add(chunk)
-        T_kept_gone = inverse(kept.T_map_body) @ gone.T_map_body
-        return _PathPoint(kept.id, T_kept_gone[:3, :3] @ point.position + T_kept_gone[:3, 3])
+    def remove_all(self) -> None:
+        """Remove all keyframes and the path."""
+        self.keyframes.clear()
+        self._ids.clear()
+        self._path.clear()
+        self.chunks = {chunk: [] for chunk in self.chunks}
 
     # Pose and path
 

@@ -163,18 +163,23 @@ class Room:
 
     def _remove_keyframe(self, key: KeyframeKey) -> None:
         if (run := self.runs.get(key.agent)) is not None and (one := run.remove_keyframe(key.id)) is not None:
-            self._mark(key.agent, one)
-            self._places.put(key, None)
-            self._mark_loops(self._loops.remove_keyframe(key))
-            self._views.remove(key)
+            self._forget(key, one)
+
+    def _forget(self, key: KeyframeKey, one: PlacedKeyframe) -> None:
+        """Forget all but the run's own knowledge of a keyframe that is removed."""
+        self._mark(key.agent, one)
+        self._places.put(key, None)
+        self._mark_loops(self._loops.remove_keyframe(key))
+        self._views.remove(key)
 
     def _remove_run(self, name: str) -> None:
         if (run := self.runs.get(name)) is None:
             return
-        for id_ in list(run.keyframes):
-            self._remove_keyframe(KeyframeKey(name, id_))
         for chunk in run.path_chunks:
             self._dirty[f"/paths/{run.number}/{chunk}"] = _nothing
+        for one in run.keyframes.values():
+            self._forget(KeyframeKey(name, one.id), one)
+        run.remove_all()
         self._dirty[f"/agents/{run.number}"] = _nothing
         del self.runs[name]
         self.corrections.pop(name, None)

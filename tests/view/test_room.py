@@ -229,6 +229,12 @@ def test_an_event_of_a_long_session_costs_no_more(soon: None) -> None:
             room.apply(pose("ann", k, 0.1 * j), 0.0)
         if k % 3 == 0:
             room.apply(ev.KeyframesRemoved((KeyframeKey("ann-1", int(rng.integers(0, k + 1))),)), 0.0)
+    room.apply(ev.RunRemoved("ann-1"), 0.0)
+    for k in range(600):
+        room.apply(ev.RunRemoved(f"a{k}-1"), 0.0)
+    while room.waiting:
+        room.take_drawings(1e4)
+    assert not room._drawn
 
 
 def test_maps_that_are_not_joined_stand_beside_each_other() -> None:
