@@ -1,7 +1,7 @@
 """What the live room takes of a browser: where its camera is, what it chose and where it clicked.
 
-viser trusts browsers: it calls handlers with whatever they send, and collects uploads without a limit. What is
-not one of these three messages, well formed, finite and small, never reaches it.
+viser trusts browsers: it calls handlers with whatever they send, and collects uploads without a limit. What
+is not one of these three messages, well formed, finite and small, never reaches it.
 """
 
 from __future__ import annotations

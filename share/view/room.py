@@ -285,7 +285,10 @@ class Room:
         if (place := run.place()) is None:
             return None
         shown = run.shown
-        T, is_current = shifted(place[1], self._places.offset(place[0])), run.state.has_pose and run.is_current
+        T, is_current = (
+            shifted(place[1], self._places.offset(place[0])),
+            run.state.has_pose and run.is_current,
+        )
         name, colour = f"/agents/{run.number}", self.colour(run)
         self._drawn.add(name)
         return dr.Body(

@@ -45,7 +45,8 @@ def is_installed() -> bool:
 
 
 class LiveRoom:
-    """A viewer's process, and the feed to it. One that ends by itself is started again. `close` may be repeated.
+    """A viewer's process, and the feed to it. One that ends by itself is started again. `close` may be
+    repeated.
 
     address: HOST:PORT, or a PORT of this machine. token: as in `http_guard`; None: none is needed. notify: is
     called with a line, from another thread, if the process ends by itself.
@@ -116,7 +117,9 @@ class LiveRoom:
             try:
                 self._start()
             except OSError as error:
-                self._notify(f"the live room cannot start again: {error.strerror}; the edge goes on without it")
+                self._notify(
+                    f"the live room cannot start again: {error.strerror}; the edge goes on without it"
+                )
                 return
             self.feed.reconnect(self._connection)
 
@@ -130,10 +133,8 @@ class LiveRoom:
         self._is_alive = False
         self._process.join()
         if not why:
-            try:
+            with contextlib.suppress(EOFError, OSError):
                 why = self._connection.recv_bytes().decode() if self._connection.poll() else ""
-            except (EOFError, OSError):
-                pass
         self._connection.close()
         return why or f"exit code {self._process.exitcode}"
 

@@ -92,8 +92,10 @@ def test_a_token_in_the_address_becomes_a_cookie(target: str, where: str) -> Non
     assert guard.cookie_headers() == refusal.headers[1:]
 
 
-@pytest.mark.parametrize("target", ["//[x", "/?token=\udcc3\udca9", "/?token=%ed%a0%80", "/?token=\xe9", "http://[/"])
-@pytest.mark.parametrize("given", ["\udce9", "\xe9", "\ud800", ""])
+@pytest.mark.parametrize(
+    "target", ["//[x", "/?token=\udcc3\udca9", "/?token=%ed%a0%80", "/?token=\xe9", "http://[/"]
+)
+@pytest.mark.parametrize("given", [chr(0xDCE9), chr(0xE9), chr(0xD800), ""])
 def test_odd_bytes_are_just_no_token(target: str, given: str) -> None:
     headers = {"authorization": f"Bearer {given}", "cookie": f"share_8080={given}", "host": "localhost"}
     for guard in (HttpGuard(REMOTE, TOKEN), HttpGuard(LOCAL, TOKEN)):
