@@ -20,8 +20,9 @@ _MAX_SLEEP_S = 0.1
 
 @dataclass(frozen=True)
 class PeerLimits:
-    """max_open: connections served at once. max_waiting: before they are let in, or on their way out; one more
-    closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and more by and by (per s)."""
+    """max_open: connections served at once. max_waiting: before they are let in, or on their way out; one
+    more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and more by and by (per
+    s)."""
 
     max_open: int
     max_waiting: int
