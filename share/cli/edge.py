@@ -139,9 +139,9 @@ def _open_room(address: str, token: str | None, stderr: Stderr) -> LiveRoom:
 
 
 def _shown_report(runs: list[EdgeRun], rooms: list[LiveRoom]) -> dict[str, Any]:
-    """Return the report of the edge that runs, if it does yet, with the address of its live room."""
+    """Return the report of the edge, if it runs yet, with the address of a live room that lives."""
     report = runs[0].report() if runs else {}
-    return report | {"live_room": rooms[0].endpoint} if rooms else report
+    return report | {"live_room": rooms[0].endpoint} if rooms and rooms[0].is_alive else report
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:

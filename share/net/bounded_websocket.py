@@ -20,9 +20,9 @@ _MAX_SLEEP_S = 0.1
 
 @dataclass(frozen=True)
 class PeerLimits:
-    """max_open: connections that are served at once. max_waiting: before they are let in, or on their way out;
-    one more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and more by and by
-    (per s)."""
+    """max_open: connections served at once. max_waiting: before they are let in, or on their way out; one
+    more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and more by and by (per
+    s)."""
 
     max_open: int
     max_waiting: int
@@ -84,7 +84,7 @@ class Allowance:
         return self._left >= 0
 
 
-class BoundedConnection(ServerConnection):
+class BoundedConnection(ServerConnection):  # type: ignore[misc]
     """A connection through a door. Given as `create_connection=partial(BoundedConnection, door=door)`."""
 
     def __init__(self, *args: Any, door: Door, **options: Any) -> None:

@@ -125,8 +125,8 @@ def open_pose_sinks(
 ) -> list[PoseSink]:
     """Return what sends poses by UDP to each udp:// address, or serves them at each ws:// one.
 
-    origins: web pages that may read the latter. notify: as in `PoseWebSocket`. Raises UsageError, ShareError without the extra for
-    WebSocket, TransportError if a port is in use.
+    origins: web pages that may read the latter. notify: as in `PoseWebSocket`. Raises UsageError, ShareError
+    without the extra for WebSocket, TransportError if a port is in use.
     """
     if origins and not any(address.startswith(WEBSOCKET) for address in addresses):
         raise UsageError("--poses-origin works only with --poses ws://HOST:PORT; leave it out")
@@ -189,14 +189,14 @@ _SLEEP_RATIO = 9.0  # the server's thread uses at most a tenth of a core
 class PoseWebSocket:
     """Serves poses by WebSocket (RFC 6455) at ws://HOST:PORT until closed, for web pages and engines.
 
-    One thread serves all. It sends the newest message to each reader and leaves out those that it has no time
-    for, so a slow or silent reader delays neither the agent nor another reader; one that sends more than a few
-    messages a second is disconnected.
+    One thread serves all. It sends the newest message to each reader and leaves out those that it has no
+    time for, so a slow or silent reader delays neither the agent nor another reader; one that sends more than
+    a few messages a second is disconnected.
 
     origins: web pages that may read them, such as https://app.example; others are refused, except those of
-    this machine (localhost). A program that is no browser sends none and may. notify: called once with a line,
-    from the server's thread, if this process has no file descriptors left for readers. Raises UsageError,
-    ShareError without the package, TransportError if the port is in use.
+    this machine (localhost). A program that is no browser sends none and may. notify: called once with a
+    line, from the server's thread, if this process has no file descriptors left for readers. Raises
+    UsageError, ShareError without the package, TransportError if the port is in use.
     """
 
     def __init__(
@@ -280,7 +280,7 @@ class PoseWebSocket:
             open_timeout=HANDSHAKE_S,
             close_timeout=_CLOSE_S,
             process_request=self._refuse_excess,
-            create_connection=partial(BoundedConnection, door=self._door),  # type: ignore[arg-type]
+            create_connection=partial(BoundedConnection, door=self._door),
             logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)

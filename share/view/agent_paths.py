@@ -6,6 +6,7 @@ chunks that have to be drawn again.
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,6 +63,13 @@ class _PathPoint:
     position: F64
 
 
+def _relative(one: PlacedKeyframe, other: PlacedKeyframe) -> F64 | None:
+    """Return T_one_other; None if they are not in one map."""
+    if one.T_map_body is None or other.T_map_body is None or one.map_id != other.map_id:
+        return None
+    return inverse(one.T_map_body) @ other.T_map_body
+
+
 class RunPath:
     """One run. number: names it in drawings."""
 
@@ -75,6 +83,7 @@ class RunPath:
         self.is_current = True  # the edge hears from it, and it is not lost
         self._pose: PoseShown | None = None
         self._count = 0
+        self._ids: list[int] = []  # of keyframes, in order
         self._segment_begin = 0  # first keyframe of the present segment
         self._path: dict[int, list[_PathPoint]] = {}
         self._last_position: F64 | None = None  # of the path, in the map
@@ -89,6 +98,7 @@ class RunPath:
         )
         self._count += 1
         self.keyframes[one.id] = one
+        insort(self._ids, one.id)
         self.chunks.setdefault(one.chunk, []).append(one)
         if self.T_map_odom is not None and self.map_id is not None:
             one.place(self.map_id, self.T_map_odom @ one.T_odom_body, False)
@@ -101,7 +111,7 @@ class RunPath:
             return []
         is_other_map = map_id != self.map_id
         self.map_id, self.T_map_odom = map_id, T_map_odom
-        present = (one for one in self.keyframes.values() if one.id >= self._segment_begin)
+        present = (self.keyframes[k] for k in self._ids[bisect_left(self._ids, self._segment_begin) :])
         return [
             one
             for one in present
@@ -113,25 +123,29 @@ class RunPath:
         if (gone := self.keyframes.pop(id_, None)) is None:
             return None
         self.chunks[gone.chunk].remove(gone)
-        heir = max((k for k in self.keyframes if k < id_), default=min(self.keyframes, default=None))
-        for chunk in gone.path_chunks:
-            points = self._path.get(chunk, [])
+        at = bisect_left(self._ids, id_)
+        del self._ids[at]
+        heir = self.keyframes[self._ids[max(0, at - 1)]] if self._ids else None
+        T_heir_gone = None if heir is None else _relative(heir, gone)
+        for chunk in gone.path_chunks & self._path.keys():
+            points = self._path[chunk]
+            if heir is None or T_heir_gone is None:
+                self._path[chunk] = [point for point in points if point.keyframe != id_]
+                continue
+            heir.path_chunks.add(chunk)
+            R, t = T_heir_gone[:3, :3], T_heir_gone[:3, 3]
             self._path[chunk] = [
-                moved
+                _PathPoint(heir.id, R @ point.position + t) if point.keyframe == id_ else point
                 for point in points
-                if (moved := self._inherited(point, gone, heir) if point.keyframe == id_ else point)
-                is not None
             ]
         return gone
 
-    def _inherited(self, point: _PathPoint, gone: PlacedKeyframe, heir: int | None) -> _PathPoint | None:
-        """Return a point of a removed keyframe in another one; None if they are not in one map."""
-        kept = None if heir is None else self.keyframes[heir]
-        if kept is None or kept.T_map_body is None or gone.T_map_body is None or kept.map_id != gone.map_id:
-            return None
-        kept.path_chunks |= gone.path_chunks
-        T_kept_gone = inverse(kept.T_map_body) @ gone.T_map_body
-        return _PathPoint(kept.id, T_kept_gone[:3, :3] @ point.position + T_kept_gone[:3, 3])
+    def remove_all(self) -> None:
+        """Remove all keyframes and the path."""
+        self.keyframes.clear()
+        self._ids.clear()
+        self._path.clear()
+        self.chunks = {chunk: [] for chunk in self.chunks}
 
     # Pose and path
 
@@ -145,7 +159,7 @@ class RunPath:
         if self._last_position is not None and np.linalg.norm(position - self._last_position) < _PATH_STEP_M:
             return None
         self._last_position = position
-        chunk = max(self._path, default=0)
+        chunk = next(reversed(self._path), 0)
         if len(self._path.get(chunk, ())) >= PATH_POINTS_PER_CHUNK:
             chunk += 1
             self._path[chunk] = self._path[chunk - 1][-1:]  # joined to the chunk before
@@ -158,7 +172,7 @@ class RunPath:
         """Forget the oldest chunk of a path that is too long. Return it."""
         if len(self._path) <= _MAX_PATH_CHUNKS:
             return None
-        oldest = min(self._path)
+        oldest = next(iter(self._path))
         del self._path[oldest]
         return oldest
 

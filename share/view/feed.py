@@ -12,7 +12,7 @@ import pickle
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -24,6 +24,7 @@ from share.protocol.peer import RestoredRun
 from share.types import Keyframe
 from share.view import events as ev
 from share.view import sources
+from share.view.recap import Recap
 from share.wire.messages import Hello, PoseUpdate
 
 MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB
@@ -43,12 +44,13 @@ class _Keyframe(NamedTuple):
 
 
 class ViewFeed:
-    """Sends to `connection` until `close`. No method waits or raises.
+    """Sends to `connection` until `close`; where the other end has gone, to none until `reconnect`. No method
+    waits or raises."""
 
-    on_end: called once from the sender's thread, if the other end is gone before `close`."""
-
-    def __init__(self, connection: Connection, on_end: Callable[[], None] = lambda: None) -> None:
-        self._connection, self._on_end = connection, on_end
+    def __init__(self, connection: Connection) -> None:
+        self._connection: Connection | None = connection
+        self._next_connection: Connection | None = None
+        self._recap = Recap()
         self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
         # the newest of each run or agent, not queued
         self._poses: dict[str, PoseUpdate] = {}
@@ -115,6 +117,11 @@ class ViewFeed:
         """Add an event as it is."""
         self._add(event)
 
+    def reconnect(self, connection: Connection) -> None:
+        """Go on with another viewer, which is told first what there is."""
+        self._next_connection = connection
+        self._wake.set()
+
     def close(self, wait_s: float = 1.0) -> None:
         """End; what is queued is sent for at most `wait_s`. May be repeated."""
         self._is_closed = True
@@ -129,18 +136,28 @@ class ViewFeed:
     # ------------------------------------------------------------------ the sender's thread
 
     def _send_loop(self) -> None:
-        try:
-            while not (self._is_closed and not self._queue):
-                self._wake.wait()
-                if not self._is_closed:
-                    time.sleep(_COLLECT_S)
-                self._wake.clear()
-                for events in batched(self._take_events()):
-                    self._connection.send_bytes(pickle.dumps(events, pickle.HIGHEST_PROTOCOL))
-            self._connection.send_bytes(END)
-        except OSError:  # the viewer's process has ended
+        while not (self._is_closed and not self._queue):
+            self._wake.wait()
             if not self._is_closed:
-                self._on_end()
+                time.sleep(_COLLECT_S)
+            self._wake.clear()
+            if (connection := self._next_connection) is not None:
+                self._connection, self._next_connection = connection, None
+                self._sent_stamps.clear()
+                for events in batched(self._recap.events()):
+                    self._send(pickle.dumps(events, pickle.HIGHEST_PROTOCOL))
+            for events in batched(self._take_events()):
+                for event in events:
+                    self._recap.apply(event)
+                self._send(pickle.dumps(events, pickle.HIGHEST_PROTOCOL))
+        self._send(END)
+
+    def _send(self, data: bytes) -> None:
+        if self._connection is not None:
+            try:
+                self._connection.send_bytes(data)
+            except OSError:  # the viewer's process has ended
+                self._connection = None
 
     def _take_events(self) -> Iterator[ev.RoomEvent]:
         if self.left_out != self._left_out_before:  # a run may have been among what was dropped

@@ -22,10 +22,10 @@ from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
 from share.view.loop_lines import LoopLines, Pair
 from share.view.loop_pictures import KeyframePictures, LoopViews, nearest_to_ray
+from share.view.map_places import MapPlaces
 from share.view.shapes import frusta, lines, named, shifted
 
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
-_MAP_SPACING_M = 10.0  # between maps that are not joined
 _MAX_CHUNKS = 12  # drawn at a time
 _FLASH_S, _TEXT_S = 1.5, 8.0  # how long a loop or correction, and a merge, stand out
 _LEAST_CORRECTION_M = 0.005  # that is marked
@@ -54,7 +54,8 @@ class Room:
         self.runs: dict[str, RunPath] = {}
         self.corrections: dict[str, LastCorrection] = {}  # by run
         self._loops, self._views = LoopLines(), KeyframePictures()
-        self._slots: dict[str, int] = {}  # place of each map, beside each other
+        self._places = MapPlaces()
+        self._colour_numbers: dict[str, int] = {}  # by name of agent
         # how to draw what has changed, by name
         self._dirty: dict[str, Callable[[], list[dr.Drawing]]] = dict.fromkeys(self._drawn, _nothing)
         self._temporary: dict[str, float] = {}  # until when things are shown, by name
@@ -87,6 +88,7 @@ class Room:
             case ev.KeyframesRemoved():
                 for key in event.keys:
                     self._remove_keyframe(key)
+                self._arrange_maps()
             case ev.RunRemoved():
                 self._remove_run(event.run)
             case ev.DecisionMade():
@@ -98,6 +100,7 @@ class Room:
         if event.run not in self.runs:
             self.runs[event.run] = RunPath(self._next_number, event)
             self._next_number += 1
+            self._colour_numbers.setdefault(event.name, len(self._colour_numbers))
 
     def _add_keyframe(self, event: ev.KeyframeShown) -> None:
         if (run := self.runs.get(event.key.agent)) is None or event.key.id in run.keyframes:
@@ -108,7 +111,6 @@ class Room:
             self._views.add(event.key, event.jpeg)
         if one.T_map_body is not None:
             self._mark(event.key.agent, one)
-        self._arrange_maps()
 
     def _add_pose(self, event: ev.PoseShown) -> None:
         if (run := self.runs.get(event.run)) is None:
@@ -134,7 +136,7 @@ class Room:
         moved_m = float(np.linalg.norm(after[1][:3, 3] - before[1][:3, 3]))
         self.corrections[event.run] = LastCorrection(now_s, moved_m)
         if moved_m >= _LEAST_CORRECTION_M:
-            ends = np.array([[before[1][:3, 3], after[1][:3, 3]]]) + self._offset(after[0])
+            ends = np.array([[before[1][:3, 3], after[1][:3, 3]]]) + self._places.offset(after[0])
             self._show_for(
                 f"/corrections/{run.number}", lines(ends, _CORRECTION_COLOUR, 5.0), now_s, _FLASH_S
             )
@@ -161,17 +163,23 @@ class Room:
 
     def _remove_keyframe(self, key: KeyframeKey) -> None:
         if (run := self.runs.get(key.agent)) is not None and (one := run.remove_keyframe(key.id)) is not None:
-            self._mark(key.agent, one)
-            self._mark_loops(self._loops.remove_keyframe(key))
-            self._views.remove(key)
+            self._forget(key, one)
+
+    def _forget(self, key: KeyframeKey, one: PlacedKeyframe) -> None:
+        """Forget all but the run's own knowledge of a keyframe that is removed."""
+        self._mark(key.agent, one)
+        self._places.put(key, None)
+        self._mark_loops(self._loops.remove_keyframe(key))
+        self._views.remove(key)
 
     def _remove_run(self, name: str) -> None:
         if (run := self.runs.get(name)) is None:
             return
-        for id_ in list(run.keyframes):
-            self._remove_keyframe(KeyframeKey(name, id_))
         for chunk in run.path_chunks:
             self._dirty[f"/paths/{run.number}/{chunk}"] = _nothing
+        for one in run.keyframes.values():
+            self._forget(KeyframeKey(name, one.id), one)
+        run.remove_all()
         self._dirty[f"/agents/{run.number}"] = _nothing
         del self.runs[name]
         self.corrections.pop(name, None)
@@ -191,15 +199,16 @@ class Room:
         self._said.append(dr.Announcement(title, event.reason))
         for run in reversed(self.runs.values()):
             if run.shown.name == event.agent and (place := run.place()) is not None:
-                position = place[1][:3, 3] + self._offset(place[0]) + (0.0, 0.0, 0.5)
+                position = place[1][:3, 3] + self._places.offset(place[0]) + (0.0, 0.0, 0.5)
                 self._show_for("/texts/merge", dr.Text("", title, position), now_s, _TEXT_S)
                 return
 
     # ------------------------------------------------------------------ what has changed
 
     def _mark(self, run_key: str, one: PlacedKeyframe) -> None:
-        """Mark all that is drawn with a keyframe."""
+        """Mark all that is drawn with a keyframe, which has another place."""
         run = self.runs[run_key]
+        self._places.put(KeyframeKey(run_key, one.id), one.map_id or None)
         for kind in ("points", "keyframes"):
             name = f"/{kind}/{run.number}/{one.chunk}"
             self._dirty[name] = partial(self._draw_keyframes, run, one.chunk, kind, name)
@@ -225,26 +234,11 @@ class Room:
         self._dirty[name] = lambda: shown
 
     def _arrange_maps(self) -> None:
-        """Give each map its place: the first at the origin, the others beside it."""
-        used = dict.fromkeys(
-            one.map_id
-            for run in self.runs.values()
-            for chunk in run.chunks.values()
-            for one in chunk[-1:]
-            if one.T_map_body is not None
-        )
-        kept = [map_id for map_id in self._slots if map_id in used]
-        slots = {map_id: k for k, map_id in enumerate([*kept, *(m for m in used if m not in kept)])}
-        moved = {map_id for map_id, slot in slots.items() if self._slots.get(map_id, slot) != slot}
-        self._slots = slots
-        for key, run in self.runs.items():
-            for one in run.keyframes.values() if moved else ():
-                if one.map_id in moved:
-                    self._mark(key, one)
-                    self._moved_runs.add(key)
-
-    def _offset(self, map_id: str) -> F64:
-        return np.array([0.0, _MAP_SPACING_M * self._slots.get(map_id, 0), 0.0])
+        """Let maps move up to where one is gone."""
+        for key in self._places.close_gaps():
+            if (one := self._keyframe(key)) is not None:
+                self._mark(key.agent, one)
+                self._moved_runs.add(key.agent)
 
     # ------------------------------------------------------------------ drawings
 
@@ -281,18 +275,20 @@ class Room:
     def agent_place(self, run_key: str) -> F64 | None:
         """Return T_room_body (4, 4) of a run; None if unknown."""
         place = None if (run := self.runs.get(run_key)) is None else run.place()
-        return None if place is None else shifted(place[1], self._offset(place[0]))
+        return None if place is None else shifted(place[1], self._places.offset(place[0]))
 
     def colour(self, run: RunPath) -> Colour:
-        """Return the colour of an agent: that of its first run."""
-        names = list(dict.fromkeys(other.shown.name for other in self.runs.values()))
-        return agent_colour(names.index(run.shown.name))
+        """Return the colour of an agent, by the order in which they came."""
+        return agent_colour(self._colour_numbers[run.shown.name])
 
     def _draw_body(self, run: RunPath) -> dr.Body | None:
         if (place := run.place()) is None:
             return None
         shown = run.shown
-        T, is_current = shifted(place[1], self._offset(place[0])), run.state.has_pose and run.is_current
+        T, is_current = (
+            shifted(place[1], self._places.offset(place[0])),
+            run.state.has_pose and run.is_current,
+        )
         name, colour = f"/agents/{run.number}", self.colour(run)
         self._drawn.add(name)
         return dr.Body(
@@ -322,7 +318,7 @@ class Room:
         placed = run.path(chunk)
         if len(placed) < 2:
             return []
-        points = np.array([position + self._offset(map_id) for map_id, position in placed])
+        points = np.array([position + self._places.offset(map_id) for map_id, position in placed])
         same_map = np.array([a[0] == b[0] for a, b in pairwise(placed)])
         segments = np.stack([points[:-1], points[1:]], axis=1)[same_map]
         return [named(lines(segments, self.colour(run), 3.0), name)] if len(segments) else []
@@ -359,7 +355,7 @@ class Room:
         """Return the pose (4, 4) of a keyframe in the room; None if unknown."""
         if one is None or one.T_map_body is None:
             return None
-        return shifted(one.T_map_body, self._offset(one.map_id))
+        return shifted(one.T_map_body, self._places.offset(one.map_id))
 
     def _keyframe(self, key: KeyframeKey) -> PlacedKeyframe | None:
         return None if (run := self.runs.get(key.agent)) is None else run.keyframes.get(key.id)

@@ -1,19 +1,23 @@
 """The live room's process: takes events, draws what has changed at most fifteen times a second.
 
 It has the lowest priority and ends with the process that started it, which it can neither hold up nor end.
+That one starts it again if it ends by itself.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
 from share.errors import ShareError, UsageError
@@ -28,6 +32,11 @@ _PANEL_S = 0.5  # between updates of the panel
 _NICENESS = 15
 _STOP_S = 2.0
 _MAX_MESSAGES = 64  # applied before something is drawn
+_MAX_REASON = 200  # characters
+_LOOK_S = 1.0  # between looks at the process
+MAX_BYTES = 2**30  # of its memory
+_LEAST_DELAY_S, _MOST_DELAY_S = 1.0, 60.0  # before it starts again
+_LONG_LIFE_S = 60.0  # after which the next start waits for the least again
 MISSING = "the live room needs viser: pip install 'viser>=1.1,<2'"
 
 
@@ -36,10 +45,11 @@ def is_installed() -> bool:
 
 
 class LiveRoom:
-    """A viewer's process, and the feed to it. `close` may be repeated.
+    """A viewer's process, and the feed to it. One that ends by itself is started again. `close` may be
+    repeated.
 
     address: HOST:PORT, or a PORT of this machine. token: as in `http_guard`; None: none is needed. notify: is
-    called with a line if the process ends by itself.
+    called with a line, from another thread, if the process ends by itself.
     Raises UsageError where viser is missing or the address is malformed, TransportError if it cannot be
     bound.
     """
@@ -49,30 +59,92 @@ class LiveRoom:
     ) -> None:
         if not is_installed():
             raise UsageError(f"--view: {MISSING}")
-        listener, bound = listen(http_address("--view", address, token))
-        self.endpoint = str(bound).removeprefix("tcp://")
-        parent_end, child_end = SPAWN_CONTEXT.Pipe()
-        self._process = SPAWN_CONTEXT.Process(
-            target=_run, args=(child_end, listener, bound, token, title), name="view", daemon=True
-        )
-        self._process.start()
-        child_end.close()
-        listener.close()
-        self._connection = parent_end
-        self.feed = ViewFeed(parent_end, lambda: notify("the live room has ended; the edge goes on"))
+        self._listener, self._bound = listen(http_address("--view", address, token))
+        self.endpoint = str(self._bound).removeprefix("tcp://")
+        self._token, self._title, self._notify = token, title, notify
+        self._closing = threading.Event()
+        self._start()
+        self.feed = ViewFeed(self._connection)
+        self._watcher = threading.Thread(target=self._watch, name="view-watch", daemon=True)
+        self._watcher.start()
 
     @property
     def pid(self) -> int | None:
         return self._process.pid
 
+    @property
+    def is_alive(self) -> bool:
+        """Whether there is a process that serves the page, or will in a moment."""
+        return self._is_alive
+
     def close(self) -> None:
         """End the process."""
+        self._closing.set()
         self.feed.close()
-        self._process.join(_STOP_S)
-        if self._process.is_alive():
+        self._watcher.join(_STOP_S)
+        if self._watcher.is_alive():
             self._process.kill()
-            self._process.join()
+            self._watcher.join()
+        self._listener.close()
+
+    def _start(self) -> None:
+        """Raises OSError if the system is out of processes, memory or file descriptors."""
+        self._connection, child_end = SPAWN_CONTEXT.Pipe()
+        self._process = SPAWN_CONTEXT.Process(
+            target=_run,
+            args=(child_end, self._listener, self._bound, self._token, self._title),
+            name="view",
+            daemon=True,
+        )
+        self._process.start()
+        child_end.close()
+        self._is_alive = True
+
+    # ------------------------------------------------------------------ the watching thread
+
+    def _watch(self) -> None:
+        delay_s = _LEAST_DELAY_S / 2
+        while True:
+            began_s = time.monotonic()
+            why = self._wait_for_end()
+            if self._closing.is_set():
+                return
+            is_long = time.monotonic() - began_s > _LONG_LIFE_S
+            delay_s = _LEAST_DELAY_S if is_long else min(_MOST_DELAY_S, 2 * delay_s)
+            self._notify(f"the live room has ended ({why}) and starts again in {delay_s:.0f} s")
+            if self._closing.wait(delay_s):
+                return
+            try:
+                self._start()
+            except OSError as error:
+                self._notify(
+                    f"the live room cannot start again: {error.strerror}; the edge goes on without it"
+                )
+                return
+            self.feed.reconnect(self._connection)
+
+    def _wait_for_end(self) -> str:
+        """Wait for the process to end, or end it if it grows too large. Return why it ended."""
+        why = ""
+        while not wait([self._process.sentinel], _LOOK_S):
+            if _memory_bytes(self._process.pid) > MAX_BYTES:
+                why = f"it took more than {MAX_BYTES / 2**20:.0f} MB of memory"
+                self._process.kill()
+        self._is_alive = False
+        self._process.join()
+        if not why:
+            with contextlib.suppress(EOFError, OSError):
+                why = self._connection.recv_bytes().decode() if self._connection.poll() else ""
         self._connection.close()
+        return why or f"exit code {self._process.exitcode}"
+
+
+def _memory_bytes(pid: int | None) -> int:
+    """Return the memory that a process holds; 0 where the system does not say."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError, ValueError):
+        return 0
 
 
 def _run(
@@ -86,12 +158,18 @@ def _run(
 
     listener.setblocking(False)
     window = Window(listener, HttpGuard(bound, token), title)
+    code = 1
     try:
         Viewer(connection, window).run()
+        code = 0
     except (EOFError, OSError):  # the parent has ended
-        pass
+        code = 0
+    except Exception as error:
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        with contextlib.suppress(OSError):
+            connection.send_bytes(text[:_MAX_REASON].encode())
     finally:
-        os._exit(0)  # threads of viser would keep the process
+        os._exit(code)  # threads of viser would keep the process
 
 
 def _silence_output() -> None:
@@ -154,8 +232,9 @@ class Viewer:
         if drawings := self._room.take_drawings(now_s):
             self._window.draw(drawings)
         for click in self._window.take_clicks():
-            if (views := self._room.loop_at(click.origin, click.direction)) is not None:
-                self._window.show_views(click.browser, views)
+            with self._window.blaming(click.browser):
+                if (views := self._room.loop_at(click.origin, click.direction)) is not None:
+                    self._window.show_views(click.browser, views)
         agents = self._panel.agents
         self._window.follow(lambda name: self._place(agents, name))
         if now_s >= self._panel_due_s:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -15,13 +16,17 @@ import numpy as np
 
 from share.colours import Colour
 from share.geometry.se3 import quat_from_matrix
+from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, Door, PeerLimits
 from share.net.http_guard import HttpGuard
 from share.types import F64, AgentKind
 from share.view import drawing as dr
+from share.view.browser_messages import is_taken
 from share.view.loop_pictures import LoopViews, shrunk
 
-_MAX_MESSAGE_BYTES = 2**20  # from a browser, which sends its camera and what is chosen
+_MAX_MESSAGE_BYTES = 2**14  # from a browser, which sends its camera and what is chosen
 MAX_BROWSERS = 16
+# The page asks for one file, then sends its camera 50 times a second at most, 300 bytes each.
+_LIMITS = PeerLimits(MAX_BROWSERS, 32, 500, 100.0, 2**18, 2**16)
 _GREY = (110, 110, 110)
 _POINT_M = 0.03
 _FRUSTUM_SIZE = 0.5
@@ -49,10 +54,9 @@ class Window:
     """Serves the page on a listening socket. Methods are called from one thread."""
 
     def __init__(self, listener: socket.socket, guard: HttpGuard, title: str) -> None:
-        with _guarded_serving(listener, guard, lambda: self._browser_count):
+        with _guarded_serving(listener, guard):
             import viser
 
-            self._browser_count = 0
             self._server = viser.ViserServer(verbose=False, label=title)
         from viser import _messages
 
@@ -73,13 +77,11 @@ class Window:
 
     def _open(self, client: Any) -> None:
         """Called by viser, from a thread of its own."""
-        self._browser_count += 1
         camera = _BrowserCamera(client, self._followed)
         camera.look_at_room(self._floor)
         self._cameras[client.client_id] = camera
 
     def _close(self, client: Any) -> None:
-        self._browser_count -= 1
         self._cameras.pop(client.client_id, None)
 
     def stop(self) -> None:
@@ -222,8 +224,7 @@ class Window:
             section_color=(90, 90, 98),
             position=((x0 + x1) / 2, (y0 + y1) / 2, floor.z),
         )
-        for camera in list(self._cameras.values()):
-            camera.look_at_room(floor)
+        self._for_each_camera(lambda camera: camera.look_at_room(floor))
 
     # ------------------------------------------------------------------ panel and cameras
 
@@ -232,13 +233,35 @@ class Window:
         if html != self._panel_html:
             self._panel_html = self._panel.content = html
         self._followed = tuple(agents)
-        for camera in list(self._cameras.values()):
-            camera.offer(self._followed)
+        self._for_each_camera(lambda camera: camera.offer(self._followed))
 
     def follow(self, place: Callable[[str], F64 | None]) -> None:
         """Move the cameras that follow an agent. place: T_room_body (4, 4) of an agent by name."""
-        for camera in list(self._cameras.values()):
-            camera.follow(place)
+        self._for_each_camera(lambda camera: camera.follow(place))
+
+    def _for_each_camera(self, act: Callable[[_BrowserCamera], None]) -> None:
+        for browser, camera in list(self._cameras.items()):
+            with self.blaming(browser):
+                act(camera)
+
+    @contextmanager
+    def blaming(self, browser: int) -> Iterator[None]:
+        """Disconnect a browser if what is done for it fails: it has sent something odd, or just left."""
+        try:
+            yield
+        except Exception:
+            self._cameras.pop(browser, None)
+            served = self._server._websock_server
+            if (connection := served._live_connections.get(browser)) is not None:
+                self._server._event_loop.call_soon_threadsafe(connection.transport.abort)
+
+
+class _BrowserConnection(BoundedConnection):
+    async def recv(self, decode: bool | None = None) -> Any:
+        """Return the next message that the room takes; others are ignored."""
+        while not is_taken(message := await super().recv(decode)):
+            pass
+        return message
 
 
 class _BrowserCamera:
@@ -349,15 +372,14 @@ def _figure(title: str, jpeg: bytes) -> str:
 
 
 @contextmanager
-def _guarded_serving(
-    listener: socket.socket, guard: HttpGuard, browsers: Callable[[], int]
-) -> Iterator[None]:
-    """Make viser serve on this socket, and only requests that the guard lets through.
+def _guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]:
+    """Make viser serve on this socket, only requests that the guard lets through, and only messages that the
+    room takes.
 
     viser offers no such thing itself; it calls `websockets.asyncio.server.serve`, once."""
     from websockets.asyncio import server
 
-    original = server.serve
+    original, door = server.serve, Door(_LIMITS)
 
     def serve(handler: Any, _host: str, _port: int, **options: Any) -> Any:
         respond = options.pop("process_request")
@@ -369,7 +391,7 @@ def _guarded_serving(
             refusal = guard.check(request.path, headers)
             if refusal is not None:
                 response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
-            elif "upgrade" in headers and browsers() >= MAX_BROWSERS:
+            elif "upgrade" in headers and not door.admit(connection):
                 response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers look on already\n"), ()
             elif (response := respond(connection, request)) is not None:
                 lines = guard.cookie_headers()
@@ -381,9 +403,14 @@ def _guarded_serving(
                 response.headers["Referrer-Policy"] = "no-referrer"
             return response
 
-        return original(
-            handler, sock=listener, process_request=check, **options | {"max_size": _MAX_MESSAGE_BYTES}
-        )
+        ours = {
+            "process_request": check,
+            "max_size": _MAX_MESSAGE_BYTES,
+            "backlog": BACKLOG,
+            "open_timeout": HANDSHAKE_S,
+            "create_connection": partial(_BrowserConnection, door=door),
+        }
+        return original(handler, sock=listener, **options | ours)
 
     server.serve = serve
     try:

@@ -75,7 +75,8 @@ def test_who_has_it_not_is_asked_for_a_password(headers: dict[str, str]) -> None
     [
         (f"/?token={TOKEN}", "/"),
         (f"/health?a=b&token={TOKEN}", "/health?a=b"),
-        (f"//evil.example/?token={TOKEN}", "/"),
+        (f"//evil.example/?token={TOKEN}", "/evil.example/"),
+        (f"//[x?token={TOKEN}&b=\udce9", "/[x?b=%3F"),
         (f"/%0d%0aX?token={TOKEN}", "/%0d%0aX"),
         (f"/\\evil?token={TOKEN}", "/evil"),
     ],
@@ -89,6 +90,17 @@ def test_a_token_in_the_address_becomes_a_cookie(target: str, where: str) -> Non
     assert "HttpOnly" in rest and "SameSite" in rest and TOKEN not in rest
     assert status(guard, cookie=f"other=1; {name}={rest.partition(';')[0]}") is None
     assert guard.cookie_headers() == refusal.headers[1:]
+
+
+@pytest.mark.parametrize(
+    "target", ["//[x", "/?token=\udcc3\udca9", "/?token=%ed%a0%80", "/?token=\xe9", "http://[/"]
+)
+@pytest.mark.parametrize("given", [chr(0xDCE9), chr(0xE9), chr(0xD800), ""])
+def test_odd_bytes_are_just_no_token(target: str, given: str) -> None:
+    headers = {"authorization": f"Bearer {given}", "cookie": f"share_8080={given}", "host": "localhost"}
+    for guard in (HttpGuard(REMOTE, TOKEN), HttpGuard(LOCAL, TOKEN)):
+        refusal = guard.check(target, headers)
+        assert refusal is not None and refusal.status == HTTPStatus.UNAUTHORIZED
 
 
 def test_without_a_token_nothing_is_set() -> None:

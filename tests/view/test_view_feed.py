@@ -153,16 +153,27 @@ def test_a_viewer_that_stops_reading_holds_nothing_up() -> None:
     assert any(isinstance(one, ev.RunShown) for one in got)  # whatever else was dropped
 
 
-def test_the_end_of_the_viewer_is_told_once() -> None:
+def test_another_viewer_is_told_what_there_is() -> None:
     here, there = Pipe()
-    ended: list[None] = []
-    feed = ViewFeed(there, lambda: ended.append(None))
+    feed = ViewFeed(there)
+    feed.add_effect(AddRun(KEY, hello_of("ann", 1)))
+    feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 0).keyframe))
+    feed.add_poses({KEY: pose(1)})
+    while not isinstance(pickle.loads(here.recv_bytes()), ev.PoseShown):
+        pass
     here.close()
-    for k in range(5):
-        feed.add_effect(WriteEvent({"t_s": k, "event": "maps merged", "agent": None, "reason": ""}))
-        time.sleep(0.02)
+    feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 1).keyframe))  # while there is no viewer
+    feed.add_event(ev.LoopAccepted(KeyframeKey(KEY, 0), KeyframeKey(KEY, 1)))
+    time.sleep(0.1)
+    here, there = Pipe()
+    feed.reconnect(there)
     feed.close()
-    assert len(ended) == 1
+    got = []
+    while (data := here.recv_bytes()) != END:
+        got.append(pickle.loads(data))
+    kinds = [type(one) for one in got]
+    assert kinds[:5] == [ev.SessionBegun, ev.RunShown, *[ev.KeyframeShown] * 2, ev.LoopAccepted]
+    assert kinds[-1] == ev.PoseShown
 
 
 def test_a_stored_map_is_told_with_its_poses_and_loops() -> None:

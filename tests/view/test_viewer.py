@@ -7,9 +7,10 @@ import os
 import pickle
 import signal
 import time
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, suppress
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -24,6 +25,7 @@ from share.view import viewer
 from share.view.viewer import LiveRoom
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
+MAX_BROWSERS = 16
 TOKEN = "a-token-of-24-characters"
 
 
@@ -142,18 +144,137 @@ def test_a_port_in_use_is_reported_before_a_process_starts(room: LiveRoom) -> No
         LiveRoom(room.endpoint, None, "test")
 
 
+def soon(is_true: Callable[[], bool], within_s: float = 20.0) -> bool:
+    deadline = time.monotonic() + within_s
+    while not is_true() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return is_true()
+
+
 @needs_viser
 @pytest.mark.long
-def test_a_killed_viewer_is_told_and_ends_nothing() -> None:
+def test_a_killed_viewer_is_reaped_told_and_started_again() -> None:
     told: list[str] = []
     with closing(LiveRoom("0", None, "test", told.append)) as room:
-        assert room.pid is not None
-        os.kill(room.pid, signal.SIGKILL)
-        deadline = time.monotonic() + 10
-        while not told and time.monotonic() < deadline:
-            show_agent(room)
-            time.sleep(0.05)
-    assert told == ["the live room has ended; the edge goes on"]
+        show_agent(room)
+        with browser(room.endpoint) as connection:
+            assert seen(connection, "/points/0/0")
+        pid = room.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        assert soon(lambda: not room.is_alive)
+        assert soon(lambda: not Path(f"/proc/{pid}").exists())  # no zombie
+        assert soon(lambda: room.is_alive)
+        assert told == ["the live room has ended (exit code -9) and starts again in 1 s"]
+        with browser(room.endpoint) as connection:  # what was told before is there again
+            assert seen(connection, "/points/0/0")
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_viewer_that_grows_too_large_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    with closing(LiveRoom("0", None, "test", told.append)):
+        monkeypatch.setattr(viewer, "MAX_BYTES", 2**20)
+        assert soon(lambda: bool(told))
+        assert told[0] == "the live room has ended (it took more than 1 MB of memory) and starts again in 1 s"
+
+
+def camera(**changed: Any) -> bytes:
+    message = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [1.0, 2.0, 3.0], "fov": 1.0}
+    message |= {"near": 0.01, "far": 1e3, "image_height": 500, "image_width": 800}
+    message |= {"look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0]}
+    return msgspec.msgpack.encode(message | changed)
+
+
+def dropdown(connection: Any) -> str:
+    """The identity of the choice of cameras, as soon as it is offered."""
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        for one in messages(connection.recv(timeout=20)):
+            if one["type"] == "GuiDropdownMessage":
+                return str(one["uuid"])
+    raise AssertionError("no dropdown")
+
+
+@needs_viser
+@pytest.mark.long
+def test_what_one_browser_sends_ends_the_room_for_nobody(room: LiveRoom) -> None:
+    """A camera of two numbers while it follows an agent; an upload of nothing; one without an end."""
+    show_agent(room)
+    room.feed.add_report({"agents": {"ann": {"run": "ann-1", "kind": "robot", "state": "OK", "gone": False}}})
+    pid = room.pid
+    with browser(room.endpoint) as bad:
+        bad.send(camera())
+        uuid = dropdown(bad)
+        choice = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": "follow ann"}}
+        bad.send(msgspec.msgpack.encode(choice))
+        bad.send(camera(position=[1.0, 2.0]))
+        upload = {"source_component_uuid": uuid, "transfer_uuid": "y", "filename": "f", "mime_type": "t"}
+        start = {"type": "FileTransferStartUpload", **upload, "part_count": 0, "size_bytes": 0}
+        bad.send(msgspec.msgpack.encode(start))
+        for k in range(30):
+            pose = np.eye(4)
+            pose[0, 3] = 0.1 * k
+            room.feed.add_event(ev.PoseShown("ann-1", TrackState.OK, 0, pose, 5.0))
+            time.sleep(0.02)
+        with browser(room.endpoint) as good:
+            assert seen(good, "/points/0/0")
+        from websockets.exceptions import ConnectionClosed
+
+        with suppress(ConnectionClosed, OSError):
+            for _ in range(100):
+                bad.send(b"x" * 10**6)
+        with pytest.raises((ConnectionClosed, OSError)):
+            bad.send(b"x")
+    with browser(room.endpoint) as good:
+        assert seen(good, "/points/0/0")
+    assert room.pid == pid
+
+
+@needs_viser
+@pytest.mark.long
+def test_browsers_count_from_the_handshake_on(room: LiveRoom) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    with ExitStack() as stack:
+        for _ in range(MAX_BROWSERS):
+            stack.enter_context(browser(room.endpoint))  # says nothing
+        with pytest.raises(InvalidStatus) as refused, browser(room.endpoint):
+            pass
+        assert refused.value.response.status_code == 503
+        assert get(room.endpoint)[0] == 200
+
+
+@needs_viser
+@pytest.mark.parametrize("failing", ["offer", "follow"])
+def test_a_failing_browser_is_disconnected_alone(failing: str) -> None:
+    from share.net.http_guard import HttpGuard, listen
+    from share.net.transport import Address
+    from share.view.window import Window
+
+    def fail(*given: Any) -> None:
+        raise ValueError("operands could not be broadcast together")
+
+    class Camera:
+        def __init__(self) -> None:
+            self.calls = 0
+
+        def note(self, *given: Any) -> None:
+            self.calls += 1
+
+        offer = follow = note
+
+    listener, bound = listen(Address("127.0.0.1", 0))
+    window, bad, good = Window(listener, HttpGuard(bound), "test"), Camera(), Camera()
+    setattr(bad, failing, fail)
+    window._cameras = {1: bad, 2: good}  # type: ignore[dict-item]
+    try:
+        window.show_panel("", ["ann"])
+        window.follow(lambda name: None)
+        assert list(window._cameras) == [2] and good.calls == 2
+    finally:
+        window.stop()
 
 
 @needs_viser
