@@ -26,7 +26,7 @@ def export_map_tables(source: str, out: Path, as_json: bool) -> None:
     if not Path(source).is_file():
         raise UsageError(f"{source}: no such file")
     if not is_map(Path(source)) and Path(source).suffix in (".mcap", ".bag", ".db3"):
-        raise UsageError(f"{source}: is no map; name what to write of a recording by --format")
+        raise UsageError(f"{source}: is not a map; for a recording give --format")
     map_state = _read_map(Path(source))
     with progress(len(map_state.keyframes), "exporting") as bar:
         exported = export_map(map_state, out, bar)

@@ -85,7 +85,7 @@ def _confirm(map_file: Path, report: ForgettingReport, yes: bool) -> None:
         return
     question = f"{map_file}: delete {_deleted_text(report)} for good?"
     if not _can_ask():
-        raise UsageError(f"{question} Nobody can be asked; add --yes")
+        raise UsageError(f"{question} stdin is not a terminal; add --yes")
     if not click.confirm(question, err=True):
         raise ShareError(f"{map_file}: nothing was deleted")
 

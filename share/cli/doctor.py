@@ -99,7 +99,7 @@ def doctor(
     ]
     if acceptance:
         if host.sensor is None:
-            raise UsageError(f"--acceptance needs a camera, which profile '{host.name}' has not")
+            raise UsageError(f"--acceptance needs a camera; profile '{host.name}' has none")
         run = _Acceptance(profile, mode, calib, minutes, out)
         findings += run.play()
         if address is not None:

@@ -27,14 +27,14 @@ class AcceptanceStep:
 
 REST, LOOP, BACK, WORK = "rest", "loop", "back", "work"
 STEPS = (
-    AcceptanceStep(REST, 0.3, "put the device on something heavy, camera into the room; leave it alone"),
+    AcceptanceStep(REST, 0.3, "place the device on a heavy table, camera facing the room; do not touch it"),
     AcceptanceStep(
         LOOP,
         0.2,
-        "mark where it stands; take it up, walk a loop of 10 m or more at ease, and set it back on the mark",
+        "mark its place; pick it up, walk a loop of at least 10 m, and put it back on the mark",
     ),
     AcceptanceStep(BACK, 0.05, "leave it on the mark"),
-    AcceptanceStep(WORK, 0.45, "use it as you will: walk, look about, near and far"),
+    AcceptanceStep(WORK, 0.45, "use it freely: walk, look around, at near and far things"),
 )
 TEN_MINUTES_S = 600.0
 
@@ -57,7 +57,7 @@ _DRIFT_OK_PPM = 200.0
 
 @dataclass(frozen=True)
 class RestNoise:
-    """Of an IMU at rest for `seconds`: white noise, u/sqrt(Hz), and bias (3,) of the gyroscope, gravity as
+    """Statistics of an IMU at rest for `seconds`: white noise, u/sqrt(Hz), gyroscope bias (3,), gravity as
     measured, and the share of the time in which it moved."""
 
     seconds: float

@@ -220,7 +220,7 @@ class _AgentPoses:
         self._owner.state = state
 
     def close(self) -> None:
-        """The owner's run closes what else is open."""
+        """Nothing to close: the run closes its own files and links."""
 
 
 class OwnCamera:
@@ -264,7 +264,7 @@ class OwnCamera:
             self._push(sample.stream, sample.stamp_ns, sample.payload)
 
     def _push(self, stream: str, stamp_ns: int, payload: Any) -> None:
-        if (sink := self._sink) is not None:  # else nobody listens: before the start, after the end
+        if (sink := self._sink) is not None:  # None before the start and after the end
             sink(DeviceSample(stream, stamp_ns, payload, time.monotonic_ns()))
 
 

@@ -11,7 +11,7 @@ from share.errors import ShareError
 
 
 class BackgroundRun(ABC):
-    """A context manager that starts it and stops it. An error in the block goes before one of its end."""
+    """Context manager: start on entry, stop on exit. An error in the block hides an error of `stop`."""
 
     @abstractmethod
     def start(self) -> None: ...

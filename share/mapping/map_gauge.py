@@ -72,7 +72,7 @@ def _gauge(places: list[SolvedPlace], shown: list[F64]) -> F64:
 
 
 def _least_motion(poses: F64, goals: F64, weights: F64) -> F64:
-    """Return the turn about the vertical and the translation (4, 4) that bring poses (N, 4, 4), and what is
+    """Return the yaw rotation and translation (4, 4) that bring poses (N, 4, 4), and the points 3 m
     ahead of them, nearest to their goals, (N, 4, 4). weights (N,): their sum is 1."""
     centre, goal_centre = weights @ poses[:, :3, 3], weights @ goals[:, :3, 3]
     arms, goal_arms = poses[:, :3, 3] - centre, goals[:, :3, 3] - goal_centre

@@ -33,7 +33,7 @@ class _Loss:
 
 
 class MapRenewal:
-    """Finds keyframes of earlier sessions that show what is gone."""
+    """Finds keyframes of earlier sessions whose scene has changed."""
 
     def __init__(
         self, graph: MapGraph, camera_views: Mapping[int, CameraView], overlap_check: OverlapCheck
@@ -52,7 +52,7 @@ class MapRenewal:
         T_new_old = self._graph.relative_pose(node_id, earlier)
         seen = gone_regions(self._camera_views[earlier], self._camera_views[node_id], T_new_old)
         if not seen.is_informative or seen.found_share < OTHER_DAY.found:
-            return  # too dark to tell
+            return  # too few of its points are found: darkness, blur
         loss = self._losses.setdefault(earlier, _Loss())
         excess = seen.missing_share - SAME_DAY.missing
         loss.missing, loss.view_count = max(0.0, loss.missing + excess), loss.view_count + (excess > 0)

@@ -1,4 +1,4 @@
-"""Missing points of two views, if the two stand as verification says.
+"""Missing points of two views, given the relative pose from verification.
 
 Two places that look alike share most points, but what only one of them has is missing in the other. Single
 points are missing anywhere (missed detections, occlusion); where all points of a patch of the image are

@@ -2,7 +2,7 @@
 
 At rest, a tilt and an accelerometer bias cannot be distinguished; rotation and acceleration separate them.
 Then the filter rotates all it has estimated about the place where it began, and a wearer would see the room
-tilt. So odom keeps the tilt that it began with, and turns upright at a speed that nobody notices. The up
+tilt. So odom keeps the tilt that it began with, and turns upright at an imperceptible speed. The up
 direction that keyframes carry is the filter's. Poses relative to others in the filter are not affected.
 """
 

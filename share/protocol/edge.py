@@ -52,9 +52,9 @@ class Edge(RoomMembership):
         self._version_throttle, self._internal_errors = Throttle(_VERSION_REFUSAL_HZ, 1.0), 0
 
     def handle(self, event: ed.EdgeEvent, now_ns: int) -> list[ed.EdgeEffect]:
-        """Return the effects of `event`. now_ns: the edge's clock, never falling.
+        """Return the effects of `event`. now_ns: the edge's clock, never decreasing.
 
-        An exception is a bug of ours and costs this event only: it is counted and recorded."""
+        An exception is a bug in SHARE. Only this event is lost; it is counted and recorded."""
         self._out.begin(now_ns)
         try:
             # first: after a hello, the keyframes of a forgotten run would count as known

@@ -22,7 +22,7 @@ _MAX_REORDERING = 1000  # corrections; a larger step back is a restart of the co
 class EdgeSessions:
     """Sessions of the edge as the agent sees them. session: the present one; None before the first.
 
-    A session starts with the answer to a hello, so an edge that names new sessions unasked cannot reset the
+    A session starts with the answer to a hello, so unsolicited session ids cannot reset the
     agent with each message."""
 
     def __init__(self) -> None:
@@ -61,7 +61,7 @@ class EdgeSessions:
 
 
 class WelcomeOutcome(Enum):
-    """What a welcome means to the agent."""
+    """Result of a welcome."""
 
     OUTDATED = auto()  # of an earlier session
     UNSOLICITED = auto()

@@ -1,4 +1,4 @@
-"""Who takes part in a room: hellos, welcomes and refusals, runs that come back, fall silent, leave."""
+"""Membership of runs in a room: hello, welcome, refusal, reconnection, timeout, leave."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RoomMembership:
         return self._admission.objection(event, hello, self._registry, self._out.now_ns)
 
     def _make_room(self, peer: Peer) -> None:
-        """Send away who has to leave for a run that has joined."""
+        """Remove the robots that are displaced by a run that has joined."""
         displaced = self._rate_scheduler.displaced(peer.name, peer.hello.kind, self._out.now_ns)
         for other in self._registry.present() if displaced else ():
             if other.name in displaced:
@@ -120,7 +120,7 @@ class RoomMembership:
         """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""
         for other in self._registry.present():
             if other.name == name:
-                self._mark_gone(other, "silent", "name taken by a newer run")
+                self._mark_gone(other, "silent", "replaced by a newer run of the same name")
 
     def _check_silence(self) -> None:
         limit_s = self._config.edge.silent_s
@@ -138,7 +138,7 @@ class RoomMembership:
         for peer in self._registry.removable():
             self._forget(peer)
             self._out.save(RemoveRun(peer.key))
-            self._out.record("forgotten", peer, f"the map has nothing left of run {peer.key}")
+            self._out.record("forgotten", peer, f"the map no longer holds any keyframe of run {peer.key}")
 
     def _forget(self, peer: Peer) -> None:
         """Remove a run and its state for good."""

@@ -39,13 +39,13 @@ class RobotBridge:
         self._published: PlanarPose | None = None
         self._edge_lost_ns: int | None = None
         self._too_fast_ns: int | None = None
-        self._fault: str | None = ""  # what was said last; "" at the beginning
+        self._fault: str | None = ""  # last line printed; "" at the start
         self._line_limiter = LineLimiter()
         self._effects: list[ev.RobotEffect] = []
         self._now_ns = 0
 
     def handle(self, event: ev.RobotEvent, now_ns: int) -> list[ev.RobotEffect]:
-        """Return the effects of `event` at `now_ns`, never falling."""
+        """Return the effects of `event` at `now_ns`, ns, which never decreases."""
         self._effects, self._now_ns = [], now_ns
         match event:
             case ev.AgentPoseReceived():
@@ -218,7 +218,7 @@ class RobotBridge:
         active = self._goals.active
         values = (event.x, event.y, 0.0 if event.yaw is None else event.yaw)
         if not all(math.isfinite(value) and abs(value) < 1e5 for value in values):
-            return "its numbers are not those of a place"
+            return "x, y or yaw is not finite or too large"
         if event.map_id is not None and event.map_id != self._place.map_id:
             return f"it is in the map {printable(event.map_id)[:100]}, the robot in {self._place.map_id}"
         if active is not None and active.commander != event.commander:
@@ -249,7 +249,7 @@ class RobotBridge:
         silence_s = self._settings.edge_silence_s
         if self._edge_lost_ns is None or self._now_ns - self._edge_lost_ns <= seconds_to_ns(silence_s):
             return None
-        return f"the agent has not heard its edge for {silence_s:g} s"
+        return f"the agent has received nothing from its edge for {silence_s:g} s"
 
     def _area_refusal(self, pose: PlanarPose, what: str) -> str | None:
         area = self._settings.area

@@ -1,4 +1,4 @@
-"""One goal at a time, from the commander's wish to the robot's last word: the robot's status list decides.
+"""One goal at a time, from request to final status. The robot's GoalStatusArray is authoritative.
 
 Replies to a goal can come seconds late and do not say which goal they answer, so they only explain.
 """
@@ -34,7 +34,7 @@ class ActiveGoal:
     refused_ns: int | None = None
     stopped_ns: int | None = None
     stop_reason: str = ""
-    is_unconfirmed: bool = False  # and said so
+    is_unconfirmed: bool = False  # and reported
     failed_ns: int | None = None
 
 

@@ -92,13 +92,13 @@ class MapOdom:
 
     def _fault_of(self, pose: ev.AgentPoseReceived) -> str | None:
         if not pose.state.has_pose:
-            return f"{pose.agent} has lost itself ({pose.state})"
+            return f"{pose.agent} has lost tracking ({pose.state})"
         if pose.T_map_body is None or pose.map_id is None:
-            return f"{pose.agent} has no place in the map yet"
+            return f"{pose.agent} is not localised in the map yet"
         if pose.sigma_m is None:
-            return f"{pose.agent} does not know how sure its pose is; give it a camera with an IMU"
+            return f"{pose.agent} sends no covariance; use a camera with an IMU"
         if pose.sigma_m > self._settings.max_sigma_m:
-            return f"{pose.agent} knows its place to no better than {self._settings.max_sigma_m:g} m"
+            return f"{pose.agent}'s position sigma exceeds {self._settings.max_sigma_m:g} m"
         return None
 
     def _resolve(self) -> MapMoved | None:

@@ -20,7 +20,7 @@ class AgentPoseReceived:
 
     T_map_body (4, 4), map_id: None without a pose in the map. sigma_m: standard deviation of the position
     on the floor; None if the agent does not know it. age_ns: of the frame; None if the agent does not say.
-    has_edge: whether the agent hears its edge; None if it does not say.
+    has_edge: whether the agent receives its edge's messages; None if not stated.
     """
 
     agent: str
@@ -46,7 +46,7 @@ class OdometryReceived:
 
 @dataclass(frozen=True)
 class ForeignMapFrame:
-    """Another program says where `odom` is. frame: in which frame."""
+    """Another program publishes `frame` → odom."""
 
     frame: str
 
@@ -117,7 +117,7 @@ class StatusReceived:
 
 @dataclass(frozen=True)
 class FeedbackReceived:
-    """How far the robot has still to go, m, as it says."""
+    """Nav2's feedback: distance remaining, m."""
 
     goal_id: bytes
     distance_m: float

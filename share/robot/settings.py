@@ -1,4 +1,4 @@
-"""What a bridge is told of its robot: where the camera sits, and how it may be driven."""
+"""Settings of a robot bridge: camera extrinsics, speed, accuracy and area limits."""
 
 from __future__ import annotations
 

@@ -1,3 +1,3 @@
-"""What the edge serves first: QoE of each agent, keyframe rates by policy, the merge gate
+"""Scheduling: QoE of each agent, keyframe rates by policy, the merge gate
 (docs/understand/scheduling.md).
 """

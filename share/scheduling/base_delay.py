@@ -1,4 +1,4 @@
-"""The delay that is there at any rate: the least of the last minutes."""
+"""Base delay: the minimum delay of the last minutes, present at any keyframe rate."""
 
 from __future__ import annotations
 

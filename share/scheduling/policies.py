@@ -113,7 +113,7 @@ class Policy:
         return None
 
     def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
-        """Return who has to leave for an agent that joins, by name."""
+        """Return the names of the robots to remove so that a joining agent can be served."""
         return ()
 
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:

@@ -65,11 +65,11 @@ class RateScheduler:
         return self._policy.objection(agent, kind, now_ns)
 
     def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
-        """Return who has to leave for an agent that joins, by name."""
+        """Return the names of the robots to remove so that a joining agent can be served."""
         return self._policy.displaced(agent, kind, now_ns)
 
     def capacity_news(self, now_ns: int) -> str | None:
-        """Return why one more agent finds no room, or that it does again, where that has changed."""
+        """Return a line if the room has become full, or has capacity again; None if unchanged."""
         was_full, self._is_full = self._is_full, (reason := self.full_reason(now_ns)) is not None
         return None if was_full == self._is_full else reason or "there is room again"
 

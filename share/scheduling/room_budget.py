@@ -25,8 +25,8 @@ from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, QoeTable
 from share.types import F64, AgentKind
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
-JOINING_HZ = 1.0  # of who shares a map with nobody yet
-SLOW_START_HZ = 2.0  # of who sends its first keyframes
+JOINING_HZ = 1.0  # Hz, of an agent that is alone in its map
+SLOW_START_HZ = 2.0  # Hz, of an agent that sends its first keyframes
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s

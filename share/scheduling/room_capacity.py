@@ -22,7 +22,7 @@ _SETTLED_S = 10.0  # for so long the room must have been full: a pause of the ed
 
 @dataclass(frozen=True)
 class RoomCapacity:
-    """What the room could still take when it was last looked at. delay_ms: of headsets with one more agent,
+    """Capacity at the last check. delay_ms: predicted delay of headsets with one more agent,
     by its form. full_since_ns: since when that has been too much. leaving: robots that would make room for
     one more headset, by name, the newest first; leaving_since_ns: since when there have been any."""
 
@@ -81,7 +81,7 @@ def headset_delay_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection
 
 
 def _lower_quartile(values: Iterable[float]) -> float:
-    """Return what three quarters of the agents report or exceed: nobody is sent away on the word of a few."""
+    """Return what three quarters of the agents report or exceed: few false reports remove none."""
     ordered = sorted(values)
     return ordered[(len(ordered) - 1) // 4]
 

@@ -14,10 +14,10 @@ from share.wire.messages import Evaluation
 
 _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
-_STARTING_NS = 10_000_000_000  # who has not sent them by then takes no part from others
+_STARTING_NS = 10_000_000_000  # after this time an agent without keyframes no longer reserves a share
 _STARTING_LOAD = 0.5  # of the air, for all that begin
 _PLENTY = 0.75  # of what is noticed: less, and the air is no longer short
-_STEP_HZ = 0.25  # by which a rate that was cut rises in each period
+_STEP_HZ = 0.25  # rise per period of a rate that was reduced
 
 
 class RoomController:
@@ -72,7 +72,7 @@ class RoomController:
             updated_ns=now_ns,
             is_placed=is_placed,
         )
-        if not counts[0]:  # no keyframe bears out what it reports
+        if not counts[0]:  # no keyframe has arrived that would confirm its report
             return self.first_grant(terms.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]

@@ -1,4 +1,4 @@
-"""What the live room knows of one run of an agent: keyframes, path and pose.
+"""One run of an agent in the live room: its keyframes, path and pose.
 
 Things that are drawn together are *chunks*: of the run's keyframes, and of its path. A change names the
 chunks that have to be drawn again.
@@ -18,7 +18,7 @@ from share.view.events import KeyframeShown, PoseShown, RunShown
 KEYFRAMES_PER_CHUNK, PATH_POINTS_PER_CHUNK = 32, 128
 _PATH_STEP_M = 0.03
 _MAX_PATH_CHUNKS = 400  # of a run: 50,000 points; the oldest are forgotten
-_MOVED_M, _MOVED_RAD = 4e-3, 4e-3  # what is not seen to move is not drawn again
+_MOVED_M, _MOVED_RAD = 4e-3, 4e-3  # smaller changes of a pose are not redrawn
 
 
 @dataclass(eq=False, slots=True)
@@ -37,7 +37,7 @@ class PlacedKeyframe:
     loop_chunks: set[int] = field(default_factory=set)
 
     def place(self, map_id: str, T_map_body: F64, is_solved: bool) -> bool:
-        """Move it. Return whether that is seen."""
+        """Set the pose. Return True if the change is large enough to be drawn."""
         self.is_solved = is_solved
         if (
             self.T_map_body is not None
@@ -80,7 +80,7 @@ class RunPath:
         self.map_id: str | None = None
         self.T_map_odom: F64 | None = None
         self.state = TrackState.INITIALISING
-        self.is_current = True  # the edge hears from it, and it is not lost
+        self.is_current = True  # the edge receives its messages, and it is not LOST
         self._pose: PoseShown | None = None
         self._count = 0
         self._ids: list[int] = []  # of keyframes, in order
@@ -181,7 +181,7 @@ class RunPath:
             one.path_chunks.add(chunk)
 
     def place(self) -> tuple[str, F64] | None:
-        """Return the run's map and its pose there; None if unknown."""
+        """Return the map id and T_map_body (4, 4) of the newest pose; None if unknown."""
         if self._pose is None:
             return None
         reference = self._reference(self._pose.keyframe)

@@ -1,4 +1,4 @@
-"""What a viewer draws: things with names, each of which replaces an earlier one of its name."""
+"""Objects that a viewer draws. An object replaces an earlier one of the same name."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Text:
 
 @dataclass(frozen=True)
 class FloorGrid:
-    """Height of the floor, m, and what it has to carry: least and largest x and y."""
+    """Floor at height z, m, from the corner `low` to the corner `high` (x, y), m."""
 
     z: float
     low: tuple[float, float]
@@ -80,7 +80,7 @@ class FloorGrid:
 
 @dataclass(frozen=True)
 class Removed:
-    """The thing of this name is gone."""
+    """Remove the object of this name."""
 
     name: str
 

@@ -1,4 +1,4 @@
-"""What the live room gets: small frozen values, from the edge or from `share track`."""
+"""Input events of the live room, sent by the edge or by `share track`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the edge tells the live room, without ever waiting: a bounded queue that drops its oldest entries.
+"""Bounded queue from the edge to the live room. It never blocks the edge; when full it drops its oldest.
 
 The edge's loop only appends values that it has anyway; of poses, reports and refusals the newest is kept. A
 thread makes events of them and sends them to the

@@ -21,7 +21,7 @@ _MOST_ANGLE_RAD = 0.05  # between a click's ray and a loop
 
 @dataclass(frozen=True)
 class LoopViews:
-    """The two views of a loop: who saw them, and JPEGs; empty where they are kept no longer."""
+    """The two keyframes of a loop: titles (agent, id) and JPEGs, b"" if no longer kept."""
 
     titles: tuple[str, str]
     jpegs: tuple[bytes, bytes]

@@ -30,7 +30,7 @@ class _AgentHistory:
 
 
 class SidePanel:
-    """Collects what is said of agents. Times are the viewer's, s."""
+    """Keeps the newest report and decisions of each agent. Times are the viewer's, s."""
 
     def __init__(self) -> None:
         self._history: dict[str, _AgentHistory] = {}  # by name
@@ -62,7 +62,7 @@ class SidePanel:
         """Return the panel as it is now."""
         parts = [f'<div style="color:{_BAD}">{escape(line)}</div>' for line in self._report.trouble]
         if self._report.left_out:
-            text = f"this view was too slow for {self._report.left_out} updates, which are not shown"
+            text = f"{self._report.left_out} updates were dropped: this view is too slow"
             parts.append(f'<div style="color:{_BAD}">{text}</div>')
         for label, agent in sorted(self._report.agents.items(), key=lambda item: (item[1]["gone"], item[0])):
             run = room.runs.get(agent["run"])

@@ -27,8 +27,8 @@ from share.view.shapes import frusta, lines, named, shifted
 
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
 _MAX_CHUNKS = 12  # drawn at a time
-_FLASH_S, _TEXT_S = 1.5, 8.0  # how long a loop or correction, and a merge, stand out
-_LEAST_CORRECTION_M = 0.005  # that is marked
+_FLASH_S, _TEXT_S = 1.5, 8.0  # s, for which a new loop or correction, and a merge, are highlighted
+_LEAST_CORRECTION_M = 0.005  # m; smaller corrections are not drawn
 _FLOOR_STEP_M = 0.3  # a lower floor is not drawn again for less
 _FLOOR_MARGIN_M, _MOST_SPARE_M = 1.0, 6.0
 
@@ -50,7 +50,7 @@ class Room:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin without a map; what is drawn is to be removed."""
+        """Reset to an empty map; mark all that is drawn for removal."""
         self.runs: dict[str, RunPath] = {}
         self.corrections: dict[str, LastCorrection] = {}  # by run
         self._loops, self._views = LoopLines(), KeyframePictures()
@@ -332,7 +332,7 @@ class Room:
         return [] if ends is None else [dr.Marks(name, ends.mean(axis=1), _LOOP_COLOUR)]
 
     def loop_at(self, origin: F64, direction: F64) -> LoopViews | None:
-        """Return what the loop saw that a ray meets, origin (3,), direction (3,); None if it meets none."""
+        """Return the views of the loop nearest to a ray: origin (3,), direction (3,); None if far."""
         placed = [(pair, ends[0]) for pair in self._loops if (ends := self._loop_ends([pair])) is not None]
         middles = np.array([ends.mean(axis=0) for _, ends in placed])
         if (nearest := nearest_to_ray(middles, origin, direction)) is None:

@@ -1,4 +1,4 @@
-"""What the live room gets of values of the edge, of a map file and of the tracker."""
+"""Conversion of edge, map-file and tracker values to events of the live room."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _certain_points(image: KeyframeImage) -> F32:
 
 
 def change_shown(change: MapChange) -> ev.RoomEvent | None:
-    """Return what a change of the map means to the room; None: nothing."""
+    """Return the event for a change of the map; None if it is not drawn."""
     match change:
         case SaveLoop():
             return ev.LoopAccepted(change.loop.a, change.loop.b)
@@ -95,7 +95,7 @@ def map_shown(stored: StoredMap) -> Iterator[ev.RoomEvent]:
 
 
 def map_file_shown(path: Path) -> Iterator[ev.RoomEvent]:
-    """Yield the events that lead to what a map file holds. Raises ShareError."""
+    """Yield the events that rebuild a map file's content. Raises ShareError."""
     from share.store.loading import decode_map, read_only
 
     if path.exists() and path.stat().st_size:

@@ -106,7 +106,7 @@ class TerminalPicture:
                 canvas.draw_path(path, self._colour(name))
         for name, one in here.items():
             canvas.draw_agent(name, one, self._colour(name))
-        caption = f"map of {', '.join(here) or 'nobody now'}, {canvas.metres_wide:.0f} m wide"
+        caption = f"map of {', '.join(here) or 'no agent now'}, {canvas.metres_wide:.0f} m wide"
         return [*canvas.lines(), f"{caption[:width]:{width}}"]
 
 

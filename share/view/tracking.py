@@ -20,7 +20,7 @@ _POSES_S, _REPORT_S = 0.05, 0.5
 
 
 class TrackedAgent:
-    """Tells a feed of one tracked agent."""
+    """Sends the poses and keyframes of one tracked agent to a feed."""
 
     def __init__(self, feed: ViewFeed, name: str, rig: Rig) -> None:
         self._feed, self._run, self._rig = feed, name, rig

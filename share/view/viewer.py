@@ -222,7 +222,7 @@ class Viewer:
             for stored in map_file_shown(event.map_file):
                 self._apply(stored, now_s)
         except ShareError:
-            pass  # the edge says what is wrong with it
+            pass  # the edge reports its own problems
 
     def _apply(self, event: Any, now_s: float) -> None:
         self._panel.apply(event)

@@ -366,7 +366,7 @@ def _figure(title: str, jpeg: bytes) -> str:
     picture = (
         f'<img style="max-width:100%;max-height:34vh" src="data:image/jpeg;base64,{data}">'
         if jpeg
-        else "not kept any more"
+        else "image no longer kept"
     )
     return f'<figure style="margin:0 0 10px"><figcaption>{escape(title)}</figcaption>{picture}</figure>'
 
@@ -392,7 +392,7 @@ def _guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None
             if refusal is not None:
                 response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
             elif "upgrade" in headers and not door.admit(connection):
-                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers look on already\n"), ()
+                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
             elif (response := respond(connection, request)) is not None:
                 lines = guard.cookie_headers()
             for line in lines if response is not None else ():

@@ -71,7 +71,7 @@ def test_it_asks(room: Path, monkeypatch: pytest.MonkeyPatch, answer: str, left:
 def test_it_does_nothing_where_nobody_can_be_asked(room: Path) -> None:
     code, line = error(forget(room, "--agent", "ann"))
     assert code == 2
-    assert line.endswith("and 5 loops for good? Nobody can be asked; add --yes")
+    assert line.endswith("and 5 loops for good? stdin is not a terminal; add --yes")
     assert keyframe_count(room) == 40
 
 

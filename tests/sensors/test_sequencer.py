@@ -232,7 +232,8 @@ def test_no_stream_is_dead_after_a_pause_of_all_cameras(pause):
 def test_real_images_seconds_apart_are_paired(shared_data):
     source, counters = open_source(str(shared_data / "real" / "euroc_v1_01_keyframes")), SequencerCounters()
     streams = rig_streams(source.rig)
-    bundles = list(sequence_frames(source.measurements(), streams, source.rate_hz, CONFIG, counters))
+    merger = FrameMerger(streams, source.rate_hz, CONFIG, counters)
+    bundles = list(sequence_frames(source.measurements(), merger))
     assert len(bundles) == 50
     assert np.diff([b.stamp_ns for b in bundles]).max() > 7e9
     assert all(b.image1 is not None for b in bundles)

@@ -89,7 +89,7 @@ def write_paper(
 
 
 def _drift(trials: Sequence[Trial]) -> DriftBesideOthers:
-    """Return the drift of all agents' odometry beside others, once a session: policies do not change it."""
+    """Return odometry drift with and without others in view, once per session: policies do not affect it."""
     total = DriftBesideOthers()
     for trial in {trial.session.folder: trial for trial in trials}.values():
         truths = ground_truths(trial)

@@ -33,7 +33,7 @@ class PaperRow:
     why: str
 
 
-HEAD = ("", "the paper says", "here", "why")
+HEAD = ("", "paper", "measured", "why they differ")
 
 
 def table_of(rows: Sequence[PaperRow]) -> str:
@@ -75,7 +75,7 @@ def summary_rows(
         ),
         PaperRow(
             "AR latency of `streamed`, ms",
-            "a bar a trajectory; no figure is known to us",
+            "one bar per trajectory; no number given",
             format_number(streamed_ms, ".1f") if streamed else "not played",
             "raw frames are sent and tracked by the edge; in real time, on this machine's load",
         ),
@@ -103,7 +103,7 @@ def summary_rows(
             f"better than `{BASE}` by ATE",
             "13 of 15 agents on a trajectory",
             f"{no_worse} of {total}",
-            "among errors of millimetres chance decides",
+            "differences of millimetres are within run-to-run variation",
         ),
         PaperRow(
             "AR QoE; robot QoE",

@@ -1,4 +1,4 @@
-"""What others' programs open: trajectories, points and pictures of a recording, a run or a map.
+"""Export of a recording, run or map (poses, points, images) to formats of other programs.
 
 scene           what is exported, whatever it comes from
 names           names of files, folders, topics and frames
