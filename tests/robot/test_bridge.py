@@ -131,11 +131,11 @@ def _second_robot(drive: RobotDrive) -> None:
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
-        (_lose, "lost itself"),
+        (_lose, "lost tracking"),
         (_silence_agent, "no pose for 0.5 s"),
         (_silence_robot, "no odometry for 0.5 s"),
-        (_make_unsure, "no better than 0.1 m"),
-        (_forget_sigma, "how sure"),
+        (_make_unsure, "sigma exceeds 0.1 m"),
+        (_forget_sigma, "sends no covariance"),
         (_start_amcl, "another program publishes map → odom"),
         (_break_odometry, "not finite"),
         (_set_clock, "more than 1 s behind"),
@@ -163,7 +163,7 @@ def test_what_comes_back_is_published_again_but_no_goal_goes_on(drive: RobotDriv
     drive.goals = [(goal_id, ev.GoalStatus.CANCELED)]
     drive.state = TrackState.OK
     drive.run(0.5)
-    assert drive.last_report == ev.GoalReport("ann", "stopped: bot has lost itself (LOST)", is_final=True)
+    assert drive.last_report == ev.GoalReport("ann", "stopped: bot has lost tracking (LOST)", is_final=True)
     assert [e for e in drive.run(0.5) if isinstance(e, ev.PublishMapOdom)]
     assert len(drive.of(ev.SendGoal)) == 1
 
@@ -207,7 +207,7 @@ def test_dead_man_the_edge_is_gone(drive: RobotDrive) -> None:
     drive.run(4.5)
     assert not drive.of(ev.CancelGoal)
     drive.run(1.0)
-    assert stopped_for(drive, "not heard its edge for 5 s")
+    assert stopped_for(drive, "received nothing from its edge for 5 s")
     assert [e for e in drive.run(0.5) if isinstance(e, ev.PublishMapOdom)]  # odometry goes on
 
 

@@ -295,7 +295,7 @@ def test_lost_pose_stops_the_robot(room: Callable[..., Room]) -> None:
     assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
     here.state = TrackState.LOST
     assert here.run(5.0, here.ended)
-    assert here.reports[-1].text == "stopped: bot has lost itself (LOST)"
+    assert here.reports[-1].text == "stopped: bot has lost tracking (LOST)"
     here.robot.forget()
     here.run(1.0)
     assert not here.robot.of("tf")[3:] and here.robot.of("tf_missing")

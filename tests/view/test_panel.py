@@ -58,7 +58,11 @@ def test_trouble_and_decisions_are_said_with_their_reason() -> None:
             ev.DecisionMade(2.5, "maps merged", "ann", "B into A by 3 loops"),
         )
     )
-    for part in ("poses come 3.4 s, limit 20 ms", "the disk is full", "too slow for 7 updates"):
+    for part in (
+        "poses come 3.4 s, limit 20 ms",
+        "the disk is full",
+        "7 updates were dropped: this view is too slow",
+    ):
         assert part in text
     assert "maps merged: B into A by 3 loops" in text and "2.5 s maps merged: ann: B into A" in text
     assert "17 inliers" not in text  # a newer decision replaced it

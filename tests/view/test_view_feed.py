@@ -159,7 +159,7 @@ def test_another_viewer_is_told_what_there_is() -> None:
     feed.add_effect(AddRun(KEY, hello_of("ann", 1)))
     feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 0).keyframe))
     feed.add_poses({KEY: pose(1)})
-    while not isinstance(pickle.loads(here.recv_bytes()), ev.PoseShown):
+    while not any(isinstance(one, ev.PoseShown) for one in pickle.loads(here.recv_bytes())):
         pass
     here.close()
     feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 1).keyframe))  # while there is no viewer
@@ -170,7 +170,7 @@ def test_another_viewer_is_told_what_there_is() -> None:
     feed.close()
     got = []
     while (data := here.recv_bytes()) != END:
-        got.append(pickle.loads(data))
+        got += pickle.loads(data)
     kinds = [type(one) for one in got]
     assert kinds[:5] == [ev.SessionBegun, ev.RunShown, *[ev.KeyframeShown] * 2, ev.LoopAccepted]
     assert kinds[-1] == ev.PoseShown
