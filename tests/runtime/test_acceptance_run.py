@@ -69,7 +69,7 @@ def played(**kinds: int) -> tuple[dict[str, str], list[str], list[AcceptanceLine
 
 def test_a_good_device_passes() -> None:
     found, said, shown = played()
-    assert len(said) == len(STEPS) and "leave it alone" in said[0]
+    assert len(said) == len(STEPS) and "do not touch it" in said[0]
     assert {one.step for one in shown} == {step.name for step in STEPS}
     assert "rest: 0:1" in str(shown[2])
     judged = {
