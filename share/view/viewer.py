@@ -37,7 +37,7 @@ _LOOK_S = 1.0  # between looks at the process
 MAX_BYTES = 2**30  # of its memory
 _LEAST_DELAY_S, _MOST_DELAY_S = 1.0, 60.0  # before it starts again
 _LONG_LIFE_S = 60.0  # after which the next start waits for the least again
-MISSING = "the live room needs viser: pip install 'viser>=1.1,<2'"
+MISSING = "the live room needs viser: pip install 'viser>=1.1,<1.2'"
 
 
 def is_installed() -> bool:

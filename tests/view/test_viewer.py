@@ -31,7 +31,7 @@ TOKEN = "a-token-of-24-characters"
 
 def test_a_missing_viser_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"--view: the live room needs viser: pip install 'viser>=1.1,<2'"):
+    with pytest.raises(UsageError, match=r"--view: the live room needs viser: pip install 'viser>=1.1,<1.2'"):
         LiveRoom("0", None, "test")
 
 
