@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from html import escape
 from typing import Any
 
@@ -16,17 +15,12 @@ import numpy as np
 
 from share.colours import Colour
 from share.geometry.se3 import quat_from_matrix
-from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, Door, PeerLimits
 from share.net.http_guard import HttpGuard
 from share.types import F64, AgentKind
 from share.view import drawing as dr
-from share.view.browser_messages import is_taken
+from share.view.guarded_server import guarded_serving, remove_tunnel
 from share.view.loop_pictures import LoopViews, shrunk
 
-_MAX_MESSAGE_BYTES = 2**14  # from a browser, which sends its camera and what is chosen
-MAX_BROWSERS = 16
-# The page asks for one file, then sends its camera 50 times a second at most, 300 bytes each.
-_LIMITS = PeerLimits(MAX_BROWSERS, 32, 500, 100.0, 2**18, 2**16)
 _GREY = (110, 110, 110)
 _POINT_M = 0.03
 _FRUSTUM_SIZE = 0.5
@@ -54,14 +48,11 @@ class Window:
     """Serves the page on a listening socket. Methods are called from one thread."""
 
     def __init__(self, listener: socket.socket, guard: HttpGuard, title: str) -> None:
-        with _guarded_serving(listener, guard):
+        with guarded_serving(listener, guard):
             import viser
 
             self._server = viser.ViserServer(verbose=False, label=title)
-        from viser import _messages
-
-        for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel to the internet
-            self._server._websock_server._incoming_handlers.pop(message, None)
+        remove_tunnel(self._server)
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.scene.set_up_direction("+z")
         self._panel = self._server.gui.add_html("")
@@ -256,14 +247,6 @@ class Window:
                 self._server._event_loop.call_soon_threadsafe(connection.transport.abort)
 
 
-class _BrowserConnection(BoundedConnection):
-    async def recv(self, decode: bool | None = None) -> Any:
-        """Return the next message that the room takes; others are ignored."""
-        while not is_taken(message := await super().recv(decode)):
-            pass
-        return message
-
-
 class _BrowserCamera:
     """The camera of one browser, and how its user moves it."""
 
@@ -369,51 +352,3 @@ def _figure(title: str, jpeg: bytes) -> str:
         else "image no longer kept"
     )
     return f'<figure style="margin:0 0 10px"><figcaption>{escape(title)}</figcaption>{picture}</figure>'
-
-
-@contextmanager
-def _guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]:
-    """Make viser serve on this socket, only requests that the guard lets through, and only messages that the
-    room takes.
-
-    viser offers no such thing itself; it calls `websockets.asyncio.server.serve`, once."""
-    from websockets.asyncio import server
-
-    original, door = server.serve, Door(_LIMITS)
-
-    def serve(handler: Any, _host: str, _port: int, **options: Any) -> Any:
-        respond = options.pop("process_request")
-
-        def check(connection: Any, request: Any) -> Any:
-            headers: dict[str, str] = {}
-            for name, value in request.headers.raw_items():
-                headers.setdefault(name.lower(), value)
-            refusal = guard.check(request.path, headers)
-            if refusal is not None:
-                response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
-            elif "upgrade" in headers and not door.admit(connection):
-                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
-            elif (response := respond(connection, request)) is not None:
-                lines = guard.cookie_headers()
-            for line in lines if response is not None else ():
-                name, _, value = line.partition(": ")
-                response.headers[name] = value
-            if response is not None:
-                response.headers["X-Frame-Options"] = "DENY"
-                response.headers["Referrer-Policy"] = "no-referrer"
-            return response
-
-        ours = {
-            "process_request": check,
-            "max_size": _MAX_MESSAGE_BYTES,
-            "backlog": BACKLOG,
-            "open_timeout": HANDSHAKE_S,
-            "create_connection": partial(_BrowserConnection, door=door),
-        }
-        return original(handler, sock=listener, **options | ours)
-
-    server.serve = serve
-    try:
-        yield
-    finally:
-        server.serve = original

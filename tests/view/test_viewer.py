@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from share.errors import TransportError, UsageError
+from share.errors import ShareError, TransportError, UsageError
 from share.mapping.loops import KeyframeKey
 from share.types import AgentKind, TrackState
 from share.view import events as ev
@@ -275,6 +275,21 @@ def test_a_failing_browser_is_disconnected_alone(failing: str) -> None:
         assert list(window._cameras) == [2] and good.calls == 2
     finally:
         window.stop()
+
+
+@needs_viser
+def test_a_viser_that_the_guard_does_not_reach_serves_nothing() -> None:
+    from share.net.http_guard import HttpGuard, listen
+    from share.net.transport import Address
+    from share.view.guarded_server import guarded_serving
+
+    listener, bound = listen(Address("127.0.0.1", 0))
+    with (
+        closing(listener),
+        pytest.raises(ShareError, match="version of viser"),
+        guarded_serving(listener, HttpGuard(bound)),
+    ):
+        pass  # another version that serves in another way
 
 
 @needs_viser

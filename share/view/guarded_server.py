@@ -1,0 +1,93 @@
+"""The server of the live room: viser behind the house's guard of requests, connections and messages.
+
+It reaches into viser and websockets where they offer no door, so the extra `view` pins viser's version.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+from share.errors import ShareError
+from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, Door, PeerLimits
+from share.net.http_guard import HttpGuard
+from share.view.browser_messages import is_taken
+
+_MAX_MESSAGE_BYTES = 2**14  # from a browser, which sends its camera and what is chosen
+MAX_BROWSERS = 16
+# The page asks for one file, then sends its camera 50 times a second at most, 300 bytes each.
+_LIMITS = PeerLimits(MAX_BROWSERS, 32, 500, 100.0, 2**18, 2**16)
+
+
+@contextmanager
+def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]:
+    """Make viser serve on this socket, only requests that the guard lets through, and only messages that the
+    room takes.
+
+    viser offers no such thing itself; it calls `websockets.asyncio.server.serve`, once. Raises ShareError if
+    it did not: nothing is served without the guard."""
+    from websockets.asyncio import server
+
+    original, door, is_guarded = server.serve, Door(_LIMITS), False
+
+    def serve(handler: Any, _host: str, _port: int, **options: Any) -> Any:
+        nonlocal is_guarded
+        is_guarded = True
+        respond = options.pop("process_request")
+
+        def check(connection: Any, request: Any) -> Any:
+            headers: dict[str, str] = {}
+            for name, value in request.headers.raw_items():
+                headers.setdefault(name.lower(), value)
+            refusal = guard.check(request.path, headers)
+            if refusal is not None:
+                response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
+            elif "upgrade" in headers and not door.admit(connection):
+                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
+            elif (response := respond(connection, request)) is not None:
+                lines = guard.cookie_headers()
+            for line in lines if response is not None else ():
+                name, _, value = line.partition(": ")
+                response.headers[name] = value
+            if response is not None:
+                response.headers["X-Frame-Options"] = "DENY"
+                response.headers["Referrer-Policy"] = "no-referrer"
+            return response
+
+        ours = {
+            "process_request": check,
+            "max_size": _MAX_MESSAGE_BYTES,
+            "backlog": BACKLOG,
+            "open_timeout": HANDSHAKE_S,
+            "create_connection": partial(_BrowserConnection, door=door),
+        }
+        return original(handler, sock=listener, **options | ours)
+
+    server.serve = serve
+    try:
+        yield
+    finally:
+        server.serve = original
+    if not is_guarded:
+        raise ShareError(
+            "the live room does not know this version of viser; install the one that setup.cfg names"
+        )
+
+
+def remove_tunnel(viser_server: Any) -> None:
+    """Refuse browsers' requests for a tunnel to the internet."""
+    from viser import _messages
+
+    for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+        viser_server._websock_server._incoming_handlers.pop(message, None)
+
+
+class _BrowserConnection(BoundedConnection):
+    async def recv(self, decode: bool | None = None) -> Any:
+        """Return the next message that the room takes; others are ignored."""
+        while not is_taken(message := await super().recv(decode)):
+            pass
+        return message
