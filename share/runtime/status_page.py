@@ -16,7 +16,7 @@ _TEMPLATE = """<!doctype html>
 <title>SHARE edge</title>
 <style>
 :root { color-scheme: light dark; --line: #8884; --dim: #888; --bad: #d22; --good: #293 }
-body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 72rem; padding: 1rem }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 84rem; padding: 1rem }
 header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem }
 h1 { font-size: 1.25rem; margin: 0 }
 h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
