@@ -55,12 +55,6 @@ def hottest_celsius(root: Path = Path("/")) -> float | None:
     return max((value / 1000 for value in readings if value is not None), default=None)
 
 
-def own_memory_bytes(proc: Path = Path("/proc")) -> int:
-    """Return the memory of this process (resident set)."""
-    pages = int((proc / "self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
 def pi_throttled_bits(root: Path = Path("/")) -> int | None:
     """Return a Raspberry Pi's supply and heat bits as `vcgencmd get_throttled`; None on other computers. A
     kernel that is not the Pi's own shows the supply alone (rpi_volt)."""

@@ -246,9 +246,7 @@ class OwnCamera:
 
     def feed_imu(self, stamp_ns: int, gyro: ArrayLike, accel: ArrayLike) -> None:
         """As `Tracker.feed_imu`. Raises UsageError."""
-        if self.rig.imu is None:
-            raise UsageError("gyro: the rig has no IMU; load a calibration with Kalibr's IMU chain")
-        sample = imu_sample(stamp_ns, gyro, accel)
+        sample = imu_sample(self.rig, stamp_ns, gyro, accel)
         for stream, values in ((ACCEL, sample.payload[3:]), (GYRO, sample.payload[:3])):
             self._push(stream, sample.stamp_ns, values)
 

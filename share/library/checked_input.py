@@ -78,9 +78,11 @@ def checked_stamp_ns(stamp_ns: int) -> int:
     return int(stamp_ns)
 
 
-def imu_sample(stamp_ns: int, gyro: ArrayLike, accel: ArrayLike) -> Measurement:
-    """Return an IMU sample. gyro (3,) rad/s, accel (3,) m/s^2, which at rest is 9.81 upwards. Raises
+def imu_sample(rig: Rig, stamp_ns: int, gyro: ArrayLike, accel: ArrayLike) -> Measurement:
+    """Return an IMU sample of a rig. gyro (3,) rad/s, accel (3,) m/s^2, which at rest is 9.81 upwards. Raises
     UsageError."""
+    if rig.imu is None:
+        raise UsageError("gyro: the rig has no IMU; load a calibration with Kalibr's IMU chain")
     values: list[float] = []
     for name, value in (("gyro", gyro), ("accel", accel)):
         values += _three_numbers(name, value)

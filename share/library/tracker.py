@@ -73,9 +73,7 @@ class Tracker:
 
         gyro (3,) rad/s, accel (3,) m/s^2 (at rest 9.81 upwards), in the body's axes. Raises ShareError.
         """
-        if self.rig.imu is None:
-            raise UsageError("gyro: the rig has no IMU; load a calibration with Kalibr's IMU chain")
-        return self._feed([imu_sample(stamp_ns, gyro, accel)])
+        return self._feed([imu_sample(self.rig, stamp_ns, gyro, accel)])
 
     def feed_images(
         self,

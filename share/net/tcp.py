@@ -93,9 +93,10 @@ def _bytes_received(descriptor: int) -> int | None:
     return int(struct.unpack_from("=Q", info, _RECEIVED_OFFSET)[0])
 
 
-def resident_bytes() -> int:
-    """Return the resident memory of this process."""
-    with open("/proc/self/statm", "rb") as file:
+def resident_bytes(pid: int | None = None) -> int:
+    """Return the resident memory of a process; None: of this one. Raises OSError where the system does not
+    say."""
+    with open(f"/proc/{pid or 'self'}/statm", "rb") as file:
         return int(file.read().split()[1]) * _PAGE_BYTES
 
 

@@ -18,6 +18,7 @@ from share.devices import host as facts
 from share.devices.acceptance import BACK, LOOP, REST, STEPS, AcceptanceStep, HostSample, RestNoise
 from share.devices.checks import CheckResult
 from share.metrics.frame_log import latency
+from share.net import tcp
 from share.recordings.recording import Source
 from share.runtime.offline_tracking import OfflineFrame, track
 from share.sensors.measurement import CAM0, CAM1, IMU
@@ -252,7 +253,7 @@ def _host_sample(t_s: float) -> HostSample:
     return HostSample(
         t_s,
         time.process_time(),
-        facts.own_memory_bytes() / 1e6,
+        tcp.resident_bytes() / 1e6,
         None if free is None else free / 1e6,
         sum(counts) if counts else None,
         facts.hottest_celsius(),

@@ -145,15 +145,17 @@ class ViewFeed:
                 self._connection, self._next_connection = connection, None
                 self._sent_stamps.clear()
                 for events in batched(self._recap.events()):
-                    self._send(pickle.dumps(events, pickle.HIGHEST_PROTOCOL))
+                    self._send(events)
             for events in batched(self._take_events()):
                 for event in events:
                     self._recap.apply(event)
-                self._send(pickle.dumps(events, pickle.HIGHEST_PROTOCOL))
+                self._send(events)
         self._send(END)
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, events: list[ev.RoomEvent] | bytes) -> None:
+        """Send events, or the end as it is; make nothing of them where nobody receives."""
         if self._connection is not None:
+            data = events if isinstance(events, bytes) else pickle.dumps(events, pickle.HIGHEST_PROTOCOL)
             try:
                 self._connection.send_bytes(data)
             except OSError:  # the viewer's process has ended

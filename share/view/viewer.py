@@ -17,10 +17,10 @@ import time
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any
 
 from share.errors import ShareError, UsageError
+from share.net import tcp
 from share.net.http_guard import HttpGuard, http_address, listen
 from share.net.transport import Address
 from share.spawning import SPAWN_CONTEXT
@@ -142,7 +142,7 @@ class LiveRoom:
 def _memory_bytes(pid: int | None) -> int:
     """Return the memory that a process holds; 0 where the system does not say."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return 0 if pid is None else tcp.resident_bytes(pid)
     except (OSError, IndexError, ValueError):
         return 0
 

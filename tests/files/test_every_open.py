@@ -69,7 +69,6 @@ ALLOWED = {
     ("net/http_guard.py", "open"): "a new file that nobody else can read",
     ("net/http_guard.py", "fdopen"): "likewise",
     ("view/viewer.py", "open"): "/dev/null",
-    ("view/viewer.py", "read_text"): KERNEL,
     ("cli/terminal_room.py", "open"): "an address of an edge that it started itself",
     ("cli/terminal_room.py", "loads"): "its answer, of a bounded size",
     ("cli/evaluate_paper.py", "read_text"): "the report that it has just written",
