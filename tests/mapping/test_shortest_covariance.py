@@ -1,10 +1,14 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from helpers.rooms import LOOP, Room, simulate
 from helpers.walking import covariance_between, surest
+from scipy.sparse.csgraph import dijkstra
 
 from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge
+from share.mapping.graph.shortest_paths import ShortestPaths
 
 
 def paths_of(room: Room, seed: int) -> tuple[CovariancePaths, list[PoseEdge]]:
@@ -76,3 +80,20 @@ def test_without_a_path_there_is_no_covariance() -> None:
     assert paths.covariances_from(3, [], {}) == []
     cov = paths.covariances_from(3, [3, 5], {3: np.eye(4), 5: np.eye(4)})
     assert np.array_equal(cov[0], np.zeros((6, 6))) and cov[1] is None
+
+
+def test_a_goal_that_cannot_be_reached_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a small part of the graph, after a search nearby: the reach grows no further than it helps."""
+    searches = 0
+
+    def counted(*given: Any, **options: Any) -> Any:
+        nonlocal searches
+        searches += 1
+        assert searches < 10
+        return dijkstra(*given, **options)
+
+    monkeypatch.setattr("scipy.sparse.csgraph.dijkstra", counted)
+    a = np.array([0, *range(10, 99)])
+    paths = ShortestPaths(100, a, a + 1, np.ones(len(a)))
+    assert paths.predecessors_of(0, np.array([1]))[1] == 0
+    assert (paths.predecessors_of(0, np.array([1, 50]))[[1, 50]] == [0, -9999]).all()

@@ -81,14 +81,15 @@ class ShortestPaths:
         """
         from scipy.sparse.csgraph import dijkstra
 
-        reach = self._last_reach
+        reach, count = self._last_reach, 0
         while True:
             cost, before = dijkstra(self._graph, indices=start, return_predecessors=True, limit=reach)
             furthest = cost[goals].max(initial=0.0)
             if np.isfinite(furthest) or reach == _FURTHEST:
                 break
-            is_most = np.isfinite(cost).sum() > len(cost) / _WIDER
-            reach = _FURTHEST if is_most else _WIDER * reach
+            count, before_count = np.isfinite(cost).sum(), count
+            is_vain = count == before_count or count > len(cost) / _WIDER  # a goal may be unreachable
+            reach = _FURTHEST if is_vain else min(_WIDER * reach, _FURTHEST)
         if np.isfinite(furthest) and furthest > 0:
             self._last_reach = 2 * float(furthest)
         return np.asarray(before, np.int64)
