@@ -5,6 +5,7 @@ It reaches into viser and websockets where they offer no door, so the extra `vie
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,14 +32,16 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
     it did not: nothing is served without the guard."""
     from websockets.asyncio import server
 
-    original, door, is_guarded = server.serve, Door(_LIMITS), False
+    original, door, is_guarded, is_built = server.serve, Door(_LIMITS), False, False
 
     def serve(handler: Any, _host: str, _port: int, **options: Any) -> Any:
         nonlocal is_guarded
         is_guarded = True
         respond = options.pop("process_request")
 
-        def check(connection: Any, request: Any) -> Any:
+        async def check(connection: Any, request: Any) -> Any:
+            while not is_built:  # viser serves before it is ready
+                await asyncio.sleep(0.01)
             headers: dict[str, str] = {}
             for name, value in request.headers.raw_items():
                 headers.setdefault(name.lower(), value)
@@ -70,7 +73,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
     try:
         yield
     finally:
-        server.serve = original
+        server.serve, is_built = original, True
     if not is_guarded:
         raise ShareError(
             "the live room does not know this version of viser; install the one that setup.cfg names"
