@@ -96,20 +96,21 @@ class TokenBuckets:
 
 
 _MAX_PAUSE_S = 60.0
-_HEALTHY_NS = 10_000_000_000  # a process that ran for this long was healthy: failures count from 1 again
+_HEALTHY_NS = 10_000_000_000  # of most processes
 
 
 class Backoff:
     """Restart delay of a process that keeps dying: 1, 2, 4 … 60 s."""
 
-    def __init__(self, now_ns: int) -> None:
-        """now_ns: when the process was first started."""
-        self._started_ns = now_ns
+    def __init__(self, now_ns: int, healthy_ns: int = _HEALTHY_NS) -> None:
+        """now_ns: when the process was first started. healthy_ns: run time after which failures count
+        anew."""
+        self._started_ns, self._healthy_ns = now_ns, healthy_ns
         self.failures = 0  # in a row
 
     def record_failure(self, now_ns: int) -> float:
         """Record that the process died. Return the delay until its restart, s."""
-        self.failures = 1 if now_ns - self._started_ns >= _HEALTHY_NS else self.failures + 1
+        self.failures = 1 if now_ns - self._started_ns >= self._healthy_ns else self.failures + 1
         pause_s = min(2.0 ** min(self.failures - 1, 30), _MAX_PAUSE_S)
         self._started_ns = now_ns + round(1e9 * pause_s)
         return pause_s

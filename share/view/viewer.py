@@ -24,6 +24,7 @@ from share.net import tcp
 from share.net.http_guard import HttpGuard, http_address, listen
 from share.net.transport import Address
 from share.spawning import SPAWN_CONTEXT
+from share.timing import Backoff
 from share.view.events import SessionBegun
 from share.view.feed import END, ViewFeed
 
@@ -35,8 +36,7 @@ _MAX_MESSAGES = 64  # applied before something is drawn
 _MAX_REASON = 200  # characters
 _LOOK_S = 1.0  # between looks at the process
 MAX_BYTES = 2**30  # of its memory
-_LEAST_DELAY_S, _MOST_DELAY_S = 1.0, 60.0  # before it starts again
-_LONG_LIFE_S = 60.0  # after which the next start waits for the least again
+_HEALTHY_NS = 60_000_000_000  # a live room that ran for so long waits 1 s again before its next start
 MISSING = "the live room needs viser: pip install 'viser>=1.1,<1.2'"
 
 
@@ -103,14 +103,12 @@ class LiveRoom:
     # ------------------------------------------------------------------ the watching thread
 
     def _watch(self) -> None:
-        delay_s = _LEAST_DELAY_S / 2
+        backoff = Backoff(time.monotonic_ns(), _HEALTHY_NS)
         while True:
-            began_s = time.monotonic()
             why = self._wait_for_end()
             if self._closing.is_set():
                 return
-            is_long = time.monotonic() - began_s > _LONG_LIFE_S
-            delay_s = _LEAST_DELAY_S if is_long else min(_MOST_DELAY_S, 2 * delay_s)
+            delay_s = backoff.record_failure(time.monotonic_ns())
             self._notify(f"the live room has ended ({why}) and starts again in {delay_s:.0f} s")
             if self._closing.wait(delay_s):
                 return
