@@ -45,7 +45,9 @@ class TerminalPicture:
         for name, one in agents.items():
             if one.get("pose_ms") is not None:
                 self._ages_ms.setdefault(name, deque(maxlen=_HISTORY)).append(one["pose_ms"])
-        text = [self._agent_line(name, one, columns) for name, one in sorted(agents.items())]
+        text = [
+            line for name, one in sorted(agents.items()) for line in self._agent_lines(name, one, columns)
+        ]
         text = text[: max(1, rows - 6)]
         height = min(_MOST_PLAN_ROWS, rows - len(text) - 1)
         return [*self._plans(plan, columns, height), *text]
@@ -53,12 +55,19 @@ class TerminalPicture:
     def _colour(self, name: str) -> Colour:
         return agent_colour(self._numbers.get(name, 0))
 
-    # ------------------------------------------------------------------ a line for each agent
+    # ------------------------------------------------------------------ lines for each agent
 
-    def _agent_line(self, name: str, agent: Report, columns: int) -> str:
+    def _agent_lines(self, name: str, agent: Report, columns: int) -> list[str]:
+        """Return a line of figures, and one of what is wrong, if anything is."""
+        troubles = "; ".join(agent.get("trouble") or ())
+        line = _Line(columns)
+        line.add(f"  {troubles}", _BAD)
+        return [self._figures_line(name, agent, columns), *([line.text()] if troubles else [])]
+
+    def _figures_line(self, name: str, agent: Report, columns: int) -> str:
         limit_ms = LIMITS[AgentKind(agent["kind"])].pose_ms
-        state, troubles = str(agent.get("state") or "–"), agent.get("trouble") or ()
-        is_bad = state in ("LOST", "SILENT") or bool(troubles)
+        state = str(agent.get("state") or "–")
+        is_bad = state in ("LOST", "SILENT") or bool(agent.get("trouble"))
         line = _Line(columns)
         line.add("■ ", self._colour(name))
         line.add(f"{name[:10]:10} {agent['kind']:5} ")
@@ -72,8 +81,6 @@ class TerminalPicture:
             block = _BLOCKS[min(len(_BLOCKS) - 1, int(4 * age_ms / limit_ms))]
             line.add(block, _BAD if age_ms > limit_ms else self._colour(name))
         line.add(f"{'':{_HISTORY - len(ages_ms)}}  {agent.get('keyframes') or 0} keyframes")
-        if troubles:
-            line.add(f"  {troubles[0]}", _BAD)
         return line.text()
 
     # ------------------------------------------------------------------ plans
