@@ -45,24 +45,16 @@ class TerminalPicture:
         for name, one in agents.items():
             if one.get("pose_ms") is not None:
                 self._ages_ms.setdefault(name, deque(maxlen=_HISTORY)).append(one["pose_ms"])
-        text = [
-            line for name, one in sorted(agents.items()) for line in self._agent_lines(name, one, columns)
-        ]
-        text = text[: max(1, rows - 6)]
+        text = [self._figures_line(name, one, columns) for name, one in sorted(agents.items())]
+        troubles = [_trouble_line(name, one, columns) for name, one in sorted(agents.items())]
+        text = [*text, *filter(None, troubles)][: max(1, rows - 6)]
         height = min(_MOST_PLAN_ROWS, rows - len(text) - 1)
         return [*self._plans(plan, columns, height), *text]
 
     def _colour(self, name: str) -> Colour:
         return agent_colour(self._numbers.get(name, 0))
 
-    # ------------------------------------------------------------------ lines for each agent
-
-    def _agent_lines(self, name: str, agent: Report, columns: int) -> list[str]:
-        """Return a line of figures, and one of what is wrong, if anything is."""
-        troubles = "; ".join(agent.get("trouble") or ())
-        line = _Line(columns)
-        line.add(f"  {troubles}", _BAD)
-        return [self._figures_line(name, agent, columns), *([line.text()] if troubles else [])]
+    # ------------------------------------------------------------------ a line for each agent
 
     def _figures_line(self, name: str, agent: Report, columns: int) -> str:
         limit_ms = LIMITS[AgentKind(agent["kind"])].pose_ms
@@ -115,6 +107,15 @@ class TerminalPicture:
             canvas.draw_agent(name, one, self._colour(name))
         caption = f"map of {', '.join(here) or 'no agent now'}, {canvas.metres_wide:.0f} m wide"
         return [*canvas.lines(), f"{caption[:width]:{width}}"]
+
+
+def _trouble_line(name: str, agent: Report, columns: int) -> str:
+    """Return what is wrong with an agent; empty if nothing is."""
+    if not (troubles := "; ".join(agent.get("trouble") or ())):
+        return ""
+    line = _Line(columns)
+    line.add(f"  {name[:10]}: {troubles}", _BAD)
+    return line.text()
 
 
 class _Line:

@@ -88,3 +88,10 @@ def test_it_fits_the_terminal(columns: int, rows: int) -> None:
 def test_a_standing_agent_is_drawn() -> None:
     lines = drawn({"agents": {"ann": agent()}}, {"agents": {"ann": place([[0.0, 0.0]])}})
     assert any("→ ann" in line for line in lines)
+
+
+def test_what_is_wrong_stands_below_the_figures() -> None:
+    report = {"agents": {"ann": agent(trouble=["LOST: dark", "no clock"]), "tom": agent()}}
+    lines = drawn(report, {"agents": {}})
+    assert [line[:5] for line in lines[:2]] == ["■ ann", "■ tom"]
+    assert [line.strip() for line in lines[2:]] == ["ann: LOST: dark; no clock"]
