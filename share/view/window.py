@@ -32,6 +32,8 @@ _MARK_M = 0.07  # radius
 _MARK = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]) * _MARK_M
 _MARK_FACES = np.array([[i, j, k] for i, j in ((0, 2), (2, 1), (1, 3), (3, 0)) for k in (4, 5)])
 _MAX_CLICKS = 16  # that wait
+_PORTRAIT = 1.3  # height by width from which the panel lies below, over three fifths of the window
+_ABOVE_PANEL = 0.5  # of half a window's height: what is looked at then stands so far above its middle
 _START = (np.array([-3.0, -4.0, 3.0]), np.array([0.0, 0.0, 0.0]))
 
 
@@ -278,10 +280,10 @@ class _BrowserCamera:
 
     def _show_room(self) -> None:
         if self._floor is None:
-            self._move(*_START)
+            self._look(*_START)
             return
         centre, size = _extent(self._floor)
-        self._move(centre + self._distance(size) * np.array([-0.45, -0.6, 0.55]), centre)
+        self._look(centre + self._distance(size) * np.array([-0.45, -0.6, 0.55]), centre)
 
     def _distance(self, size: float) -> float:
         """Return how far the camera is from a room of this diagonal; further in a narrow window."""
@@ -293,7 +295,7 @@ class _BrowserCamera:
         self._last = None
         if self._choice.value == _ABOVE and self._floor is not None:
             centre, size = _extent(self._floor)
-            self._move(centre + np.array([0.0, -0.01, self._distance(size)]), centre)
+            self._look(centre + np.array([0.0, -0.01, self._distance(size)]), centre)
         elif self._choice.value == _ORBIT:
             self._show_room()
 
@@ -303,16 +305,29 @@ class _BrowserCamera:
             return
         position, camera = T[:3, 3], self._client.camera
         if self._last is None:
-            self._move(position + np.array([-1.5, -2.0, 1.8]), position)
+            self._look(position + np.array([-1.5, -2.0, 1.8]), position)
         elif np.linalg.norm(position - self._last) > 1e-3:
             step = position - self._last
             self._move(camera.position + step, camera.look_at + step)
         self._last = position
 
+    def _look(self, position: F64, at: F64) -> None:
+        """Look from a place at another, which a narrow window shows above the panel."""
+        camera = self._client.camera
+        if camera.image_height > _PORTRAIT * camera.image_width:
+            at = at - _rise(at - position, _ABOVE_PANEL * np.tan(camera.fov / 2))
+        self._move(position, at)
+
     def _move(self, position: F64, look_at: F64) -> None:
         self._set_position = np.asarray(position)
         with self._client.atomic():
             self._client.camera.position, self._client.camera.look_at = position, look_at
+
+
+def _rise(view: F64, slope: float) -> F64:
+    """Return the step upwards, across a view that is not vertical, of `slope` times its length."""
+    up = np.cross(np.cross(view, [0.0, 0.0, 1.0]), view)
+    return np.asarray(up / np.linalg.norm(up) * np.linalg.norm(view) * slope)
 
 
 def _choices(agents: Sequence[str]) -> tuple[str, ...]:
