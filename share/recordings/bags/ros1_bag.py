@@ -1,8 +1,8 @@
 """Read an untrusted ROS 1 bag (`.bag`, format 2.0) by rosbags, its messages converted to ROS 2's CDR.
 
 rosbags unpacks chunks whatever they grow to, reads as much as a length says, and where chunks overlap in time
-unpacks one for each message. Here sizes and lengths are bounded, and each chunk is unpacked once. As bz2 makes
-a millionth of zeros, what is unpacked altogether is bounded by the size of the file, too.
+unpacks one for each message. Here sizes and lengths are bounded, and each chunk is unpacked once. As bz2
+makes a millionth of zeros, what is unpacked altogether is bounded by the size of the file, too.
 """
 
 from __future__ import annotations
