@@ -90,12 +90,17 @@ def main(out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         session = _session(work)
-        messages = _maps(work, session) + _streams(work, session)
-        (version,) = {msgspec.msgpack.decode(m["frames"][0])[0] for m in messages}
+        said = _maps(work, session) + _streams(work, session)
+        version = max(map(_version, said))
+        messages = [message for message in said if _version(message) == version]  # no Pings of earlier ones
         record = {"wire": version, "share": _said("--version"), "messages": messages}
         out.mkdir(parents=True, exist_ok=True)
         _write(out / f"wire-{version}.msgpack.gz", msgspec.msgpack.encode(record))
         _write(out / f"map-{version}.sqlite.gz", (work / "map.sqlite").read_bytes())
+
+
+def _version(message: dict[str, Any]) -> int:
+    return int(msgspec.msgpack.decode(message["frames"][0])[0])
 
 
 def _session(work: Path) -> Path:

@@ -1,28 +1,36 @@
 """WebSocket connections that cannot cost their server much, for `websockets.asyncio.server.serve`.
 
 A connection counts from its TCP handshake on, not from its first message. What waits too long, or sends more
-than it has reason to, is closed before it is parsed.
+than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets that of one
+that has long had it: who reads for ever cannot be told from who only holds a place.
 """
 
 from __future__ import annotations
 
 import selectors
 import time
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from ipaddress import ip_address
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection
 
+from share.timing import TokenBucket
+
 BACKLOG = 16  # that many are accepted at once
 HANDSHAKE_S = 5.0  # from the connection to the request's end
+SURE_S = 60.0  # that a place is its holder's, except that an address with more gives it to one with fewer
+PING_S = 10.0  # between PINGs, and until their answer: who gives none is disconnected
 _MAX_SLEEP_S = 0.1
 
 
 @dataclass(frozen=True)
 class PeerLimits:
-    """max_open: connections served at once. max_waiting: before they are let in, or on their way out; one
-    more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and more by and by (per
-    s)."""
+    """max_open: connections served at once (`place_to_free`). max_waiting: before they are let in, or on
+    their way out; one more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and
+    more by and by (per s)."""
 
     max_open: int
     max_waiting: int
@@ -32,13 +40,29 @@ class PeerLimits:
     bytes_per_s: float
 
 
+def place_to_free(places: Sequence[tuple[str, float]], address: str, now_s: float) -> int | None:
+    """Return which place a newcomer from `address` takes where all are taken, None: it is not let in.
+
+    places: the address of each connection and since when it is there, s. It is the oldest of the address with
+    the most, if that then still has as many as the newcomer's, or after SURE_S.
+    """
+    counts = Counter(holder for holder, _ in places)
+    most = max(counts.values(), default=0)
+    oldest = min((i for i, (holder, _) in enumerate(places) if counts[holder] == most), default=None,
+                 key=lambda i: places[i][1])  # fmt: skip
+    if oldest is None:
+        return None
+    is_unfair = most >= counts[address] + 2
+    return oldest if is_unfair or now_s - places[oldest][1] >= SURE_S else None
+
+
 class Door:
     """The connections of one server."""
 
     def __init__(self, limits: PeerLimits) -> None:
         self.limits = limits
         self._waiting: dict[BoundedConnection, None] = {}  # oldest first
-        self._open: set[BoundedConnection] = set()
+        self._open: dict[BoundedConnection, float] = {}  # since when, monotonic s
 
     @property
     def open_count(self) -> int:
@@ -52,17 +76,28 @@ class Door:
         self._waiting[connection] = None
 
     def admit(self, connection: Any) -> bool:
-        """Let a connection in. Return whether there is room."""
+        """Let a connection in, at the cost of another if need be. Return whether there is room."""
         if connection not in self._open:
-            if len(self._open) >= self.limits.max_open:
+            if len(self._open) >= self.limits.max_open and not self._free_place(connection):
                 return False
             self._waiting.pop(connection, None)
-            self._open.add(connection)
+            self._open[connection] = time.monotonic()
+        return True
+
+    def _free_place(self, newcomer: BoundedConnection) -> bool:
+        holders = list(self._open.items())
+        places = [(holder.address, since_s) for holder, since_s in holders]
+        chosen = place_to_free(places, newcomer.address, time.monotonic())
+        if chosen is None:
+            return False
+        holder = holders[chosen][0]
+        del self._open[holder]
+        holder.transport.abort()
         return True
 
     def leave(self, connection: BoundedConnection) -> None:
         self._waiting.pop(connection, None)
-        self._open.discard(connection)
+        self._open.pop(connection, None)
 
     def abort_all(self) -> None:
         """Close every connection at once."""
@@ -70,32 +105,19 @@ class Door:
             connection.transport.abort()
 
 
-class Allowance:
-    """What may still come: `burst` at once, and `per_s` more by and by."""
-
-    def __init__(self, burst: float, per_s: float) -> None:
-        self._burst, self._per_s = burst, per_s
-        self._left, self._at_s = burst, 0.0
-
-    def take(self, amount: float, now_s: float) -> bool:
-        """Return whether that is allowed. now_s: never less than before."""
-        self._left = min(self._burst, self._left + self._per_s * (now_s - self._at_s)) - amount
-        self._at_s = now_s
-        return self._left >= 0
-
-
 class BoundedConnection(ServerConnection):  # type: ignore[misc]
     """A connection through a door. Given as `create_connection=partial(BoundedConnection, door=door)`."""
 
     def __init__(self, *args: Any, door: Door, **options: Any) -> None:
         super().__init__(*args, **options)
-        limits = door.limits
+        limits, self.address = door.limits, ""
         self._door = door
-        self._frames = Allowance(limits.burst, limits.frames_per_s)
-        self._bytes = Allowance(limits.burst_bytes, limits.bytes_per_s)
+        self._frames = TokenBucket(limits.burst, limits.frames_per_s)
+        self._bytes = TokenBucket(limits.burst_bytes, limits.bytes_per_s)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
+        self.address = _holder_of(transport.get_extra_info("peername"))
         self._door.arrive(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -103,16 +125,22 @@ class BoundedConnection(ServerConnection):  # type: ignore[misc]
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        if self._bytes.take(len(data), self.loop.time()):
+        if self._bytes.take(time.monotonic_ns(), cost=len(data)):
             super().data_received(data)
         else:
             self.transport.abort()
 
     def process_event(self, event: Any) -> None:
-        if self._frames.take(1, self.loop.time()):
+        if self._frames.take(time.monotonic_ns()):
             super().process_event(event)
         else:
             self.transport.abort()
+
+
+def _holder_of(peer: Any) -> str:
+    """Return whose address it is: of IPv6 the first 64 bits, of which one peer has all the others."""
+    text = str(peer[0]).partition("%")[0] if peer else ""
+    return ":".join(ip_address(text).exploded.split(":")[:4]) if ":" in text else text
 
 
 class ModestSelector(selectors.DefaultSelector):

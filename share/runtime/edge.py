@@ -206,6 +206,7 @@ class EdgeRun:
             "refused": [*self._other_troubles.current(), *report["refused"]],
             "refused_handshakes": self._refused_handshakes.total(),
             "trouble": [*self._troubles.current(), *filter(None, current)],
+            "degraded": self._restarts.losses,
             "agent_trouble": trouble_lines(report["agents"]),
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
             **self._progress.last_solve(),

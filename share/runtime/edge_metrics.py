@@ -32,6 +32,7 @@ METRICS = (
     MetricSpec("share_edge_waiting_keyframes", "Keyframes waiting for place recognition.", "waiting"),
     MetricSpec("share_edge_last_solve_age_seconds", "Time since the last pose graph solve.", "last_solve_s"),
     MetricSpec("share_edge_troubles", "Number of current problems; /health lists them.", "trouble"),
+    MetricSpec("share_edge_degraded", "Number of losses of the map file; /health lists them.", "degraded"),
     MetricSpec("share_edge_failed_steps_total", "Steps of the mapper that raised an error.", "failed_steps"),
     MetricSpec("share_edge_refused_handshakes_total", "Refused attempts to connect.", "refused_handshakes"),
     MetricSpec("share_edge_maps", "Separate maps.", "maps"),

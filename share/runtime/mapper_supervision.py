@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,12 +11,14 @@ from share.errors import ShareError
 from share.mapping.map_changes import with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.mapper_process import MapperReport, RestoreMap
+from share.store.forgetting import damaged_copies
 from share.store.map_store import MapStore
 from share.timing import Backoff
 
 _SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
 _MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
 _MAX_TRIES = 3  # mappers that may die while restoring one map, before it is set aside
+_MAX_NAMES = 3  # of files, in a line
 
 
 class MapperRestarts:
@@ -34,10 +37,27 @@ class MapperRestarts:
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring = False
         self._tries = 0
+        self._copies = [] if store is None else [copy.name for copy in damaged_copies(store.path)]
+        self._asides: list[str] = []  # a line each
 
     @property
     def writable(self) -> bool:
         return self.store is not None and self.store.writable
+
+    @property
+    def losses(self) -> list[str]:
+        """What the map lacks or may lack, a line each. A line stays until the edge is restarted without its
+        cause, such as a damaged file that was kept beside the map."""
+        lines = list(self._asides)
+        if self.store is not None:
+            name = self.store.path.name
+            lines += [f"map {name}: {problem}" for problem in self.store.problems]
+            if not self.store.writable:
+                lines.append(f"map {name}: {self.store.read_only_reason}; nothing new is stored")
+        said = "\n".join(lines)
+        if earlier := [copy for copy in self._copies if not re.search(rf"{re.escape(copy)}\b", said)]:
+            lines.append(f"earlier files are kept as {_listed(earlier)}: see what they hold, move them away")
+        return lines
 
     def record_restored(self) -> None:
         """Record that the mapper has restored the map."""
@@ -74,10 +94,12 @@ class MapperRestarts:
             return
         if not self.store.writable:
             self.store = None
-            self._notify(f"the map file is no longer used: {reason}; nothing is saved")
-            return
-        renamed = self.store.set_aside()
-        self._notify(f"the map file is renamed to {renamed.name}: {reason}; a new one is started")
+            text = f"the map file is no longer used: {reason}; nothing is saved"
+        else:
+            renamed = self.store.set_aside()
+            text = f"the map file is renamed to {renamed.name}: {reason}; a new one is started"
+        self._asides.append(text)
+        self._notify(text)
 
 
 class MapperProgress:
@@ -108,6 +130,11 @@ class MapperProgress:
         if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
             return f"the solver has worked on one solution for {solving_s:.0f} s: no corrections meanwhile"
         return None
+
+
+def _listed(names: list[str]) -> str:
+    further = len(names) - _MAX_NAMES
+    return ", ".join(names[:_MAX_NAMES]) + (f" and {further} more" if further > 0 else "")
 
 
 def _solve_count(report: Mapping[str, Any]) -> int:

@@ -175,7 +175,7 @@ def _rounded(vector: F64 | None) -> list[float] | None:
     return None if vector is None else [round(value, 6) for value in vector.tolist()]
 
 
-MAX_READERS = 16  # at once; more are refused
+MAX_READERS = 16  # at once; for one more see `share.net.bounded_websocket`
 _MAX_RECEIVED_BYTES = 1024  # of a message from a reader, which none needs to send
 _MAX_WAITING = 32  # connections that are not served yet
 _BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
@@ -267,7 +267,7 @@ class PoseWebSocket:
     async def _serve(self) -> None:
         from websockets.asyncio.server import serve
 
-        from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection
+        from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, PING_S, BoundedConnection
 
         server = await serve(
             self._serve_reader,
@@ -279,6 +279,8 @@ class PoseWebSocket:
             write_limit=_UNSENT_BYTES,
             open_timeout=HANDSHAKE_S,
             close_timeout=_CLOSE_S,
+            ping_interval=PING_S,
+            ping_timeout=PING_S,
             process_request=self._refuse_excess,
             create_connection=partial(BoundedConnection, door=self._door),
             logger=_silent_logger(),

@@ -212,11 +212,12 @@ function show(now) {
   const agentCount = n => `${n} agent${n === 1 ? "" : "s"}`;
   const stale = count(a => isLost(a) || isStale(a));
   const quarantined = count(a => !a.gone && isQuarantined(a));
-  const warnings = [];
+  const degraded = now.degraded ?? [];
+  const warnings = degraded.length ? ["degraded"] : [];
   if (stale) warnings.push(`${agentCount(stale)} without a current pose`);
   if (quarantined) warnings.push(`${agentCount(quarantined)} quarantined`);
   mark(trouble.length ? "trouble" : warnings.join(", ") || "ok", trouble.length || warnings.length);
-  at("trouble").replaceChildren(...trouble.concat(now.refused ?? []).map(t => node("li", t)));
+  at("trouble").replaceChildren(...trouble.concat(degraded, now.refused ?? []).map(t => node("li", t)));
   const about = [`up ${duration(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${text(now.waiting)}`);
   if (typeof now.last_solve_s === "number") about.push(`solved ${duration(now.last_solve_s)} ago`);

@@ -77,7 +77,8 @@ class StatusServer:
 
 def _health(report: dict[str, Any]) -> Response:
     """Return health as JSON; with status 503 if the edge is in trouble, for monitors that read only the
-    status. An agent's trouble does not count there: else a peer could have the edge restarted."""
+    status. An agent's trouble does not count there: else a peer could have the edge restarted. Nor does
+    what the map has lost: a restart would not bring it back."""
     return _json(_status_of(report.get("trouble")), _health_report(report))
 
 
@@ -92,10 +93,12 @@ def _status_of(trouble: Any) -> HTTPStatus:
 
 def _health_report(report: dict[str, Any]) -> dict[str, Any]:
     trouble, agent_trouble = (list(report.get(key) or ()) for key in ("trouble", "agent_trouble"))
+    degraded = list(report.get("degraded") or ())
     agents = report.get("agents", {}).items()
     return {
-        "status": "trouble" if trouble or agent_trouble else "ok",
+        "status": "trouble" if trouble or agent_trouble else "degraded" if degraded else "ok",
         "trouble": trouble,
+        "degraded": degraded,
         "agent_trouble": agent_trouble,
         "refused": list(report.get("refused") or ()),
         "agents": sorted(name for name, agent in agents if not agent.get("gone")),

@@ -6,6 +6,7 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import asdict, dataclass, replace
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def _check_space(path: Path) -> None:
 
 def damaged_copies(path: Path) -> list[Path]:
     """Return the damaged files that were kept beside a map."""
-    return sorted(path.parent.glob(f"{path.name}.damaged-*"))
+    return sorted(path.parent.glob(f"{escape(path.name)}.damaged-*"))
 
 
 def _check_names(path: Path, kept: StoredMap, agents: Collection[str] | None) -> None:

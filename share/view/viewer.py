@@ -1,7 +1,7 @@
 """The live room's process: takes events, draws what has changed at most fifteen times a second.
 
 It has the lowest priority and ends with the process that started it, which it can neither hold up nor end.
-That one starts it again if it ends by itself.
+That one starts it again if it ends by itself, and ends it if its heartbeat stops.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from share.net import tcp
 from share.net.http_guard import HttpGuard, http_address, listen
 from share.net.transport import Address
 from share.spawning import SPAWN_CONTEXT
-from share.timing import Backoff
+from share.timing import Backoff, PeriodicTimer
 from share.view.events import SessionBegun
 from share.view.feed import END, ViewFeed
 
@@ -34,7 +34,10 @@ _NICENESS = 15
 _STOP_S = 2.0
 _MAX_MESSAGES = 64  # applied before something is drawn
 _MAX_REASON = 200  # characters
-_LOOK_S = 1.0  # between looks at the process
+_LOOK_S = 1.0  # between looks at the process, and between its heartbeats
+_HEARTBEAT = b""
+MAX_SILENT_LOOKS = 30  # in a row without a heartbeat: it hangs
+_MAX_START_LOOKS = 120  # before the first one: it has the lowest priority
 MAX_BYTES = 2**30  # of its memory
 _HEALTHY_NS = 60_000_000_000  # a live room that ran for so long waits 1 s again before its next start
 MISSING = "the live room needs viser: pip install 'viser>=1.1,<1.2'"
@@ -49,7 +52,7 @@ class LiveRoom:
     repeated.
 
     address: HOST:PORT, or a PORT of this machine. token: as in `http_guard`; None: none is needed. notify: is
-    called with a line, from another thread, if the process ends by itself.
+    called with a line, from another thread, if the process ends by itself or hangs.
     Raises UsageError where viser is missing or the address is malformed, TransportError if it cannot be
     bound.
     """
@@ -122,19 +125,41 @@ class LiveRoom:
             self.feed.reconnect(self._connection)
 
     def _wait_for_end(self) -> str:
-        """Wait for the process to end, or end it if it grows too large. Return why it ended."""
-        why = ""
-        while not wait([self._process.sentinel], _LOOK_S):
-            if _memory_bytes(self._process.pid) > MAX_BYTES:
-                why = f"it took more than {MAX_BYTES / 2**20:.0f} MB of memory"
+        """Wait for the process to end, or end it if it grows too large or hangs. Return why it ended."""
+        why, last_words, heard = "", "", [self._connection]
+        silent_looks, max_silent = 0, _MAX_START_LOOKS
+        while self._process.sentinel not in (ready := wait([self._process.sentinel, *heard], _LOOK_S)):
+            if not ready:  # counted, not timed: this process may have been stopped for a while itself
+                silent_looks += 1
+            else:
+                silent_looks, max_silent = 0, MAX_SILENT_LOOKS
+                if (text := self._hear()) is None:
+                    heard = []
+                else:
+                    last_words = text
+            if not why and (why := _fault(self._process.pid, silent_looks, max_silent)):
+                self._is_alive = False
                 self._process.kill()
         self._is_alive = False
         self._process.join()
-        if not why:
-            with contextlib.suppress(EOFError, OSError):
-                why = self._connection.recv_bytes().decode() if self._connection.poll() else ""
+        while (text := self._hear()) is not None:
+            last_words = text
         self._connection.close()
-        return why or f"exit code {self._process.exitcode}"
+        return why or last_words or f"exit code {self._process.exitcode}"
+
+    def _hear(self) -> str | None:
+        """Return the next message of the process, "" if it is a heartbeat; None where it can send no more."""
+        try:
+            return self._connection.recv_bytes(4 * _MAX_REASON).decode(errors="replace")
+        except (EOFError, OSError):
+            return None
+
+
+def _fault(pid: int | None, silent_looks: int, max_silent: int) -> str:
+    """Return why a process has to be ended, "" if it need not be."""
+    if _memory_bytes(pid) > MAX_BYTES:
+        return f"it took more than {MAX_BYTES / 2**20:.0f} MB of memory"
+    return f"it did not answer for {silent_looks * _LOOK_S:.0f} s" if silent_looks >= max_silent else ""
 
 
 def _memory_bytes(pid: int | None) -> int:
@@ -189,6 +214,7 @@ class Viewer:
         self._connection, self._window = connection, window
         self._room, self._panel = Room(), SidePanel()
         self._panel_due_s = 0.0
+        self._heartbeat = PeriodicTimer(_LOOK_S)
         self._is_ended = False
 
     def run(self) -> None:
@@ -197,7 +223,12 @@ class Viewer:
             start_s = time.monotonic()
             self._take_events(start_s)
             self._draw(time.monotonic())
+            self._show_that_it_runs()
             time.sleep(max(0.005, 1 / DRAW_HZ - (time.monotonic() - start_s)))
+
+    def _show_that_it_runs(self) -> None:
+        if self._heartbeat.fire_if_due(time.monotonic_ns()) and self._window.has_served():
+            self._connection.send_bytes(_HEARTBEAT)
 
     def _take_events(self, now_s: float) -> None:
         for _ in range(_MAX_MESSAGES):
@@ -219,6 +250,7 @@ class Viewer:
         try:
             for stored in map_file_shown(event.map_file):
                 self._apply(stored, now_s)
+                self._show_that_it_runs()
         except ShareError:
             pass  # the edge reports its own problems
 

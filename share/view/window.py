@@ -65,6 +65,7 @@ class Window:
         self._clicks: deque[Click] = deque(maxlen=_MAX_CLICKS)
         self._followed: tuple[str, ...] = ()
         self._floor: dr.FloorGrid | None = None
+        self._has_served = True
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
 
@@ -79,6 +80,16 @@ class Window:
 
     def stop(self) -> None:
         self._server.stop()
+
+    def has_served(self) -> bool:
+        """Return whether the thread that serves the browsers has run since the last call."""
+        has_served, self._has_served = self._has_served, False
+        self._server._event_loop.call_soon_threadsafe(self._note_served)
+        return has_served
+
+    def _note_served(self) -> None:
+        """Called by viser's thread."""
+        self._has_served = True
 
     # ------------------------------------------------------------------ drawing
 

@@ -180,6 +180,24 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(original, calib, tmp_path, 
         list(open_source(str(bag), calib).measurements())
 
 
+def test_many_chunks_that_are_tiny_until_unpacked_are_refused(tmp_path, monkeypatch):
+    """Ten of 4 MB in a file of some kB; a megabyte of them would take half an hour to unpack."""
+    image = np.zeros((2000, 2000), np.uint8)
+    written = [(TOPICS[CAM0], k, ros.encode_raw(ros.make_header(k, CAM0), image)) for k in range(1, 11)]
+    bag = write_ros1(tmp_path / "walk.bag", written, "BZ2", chunk_bytes=1000)
+    assert bag.stat().st_size < 50_000
+    unpack, unpacked = ros1_bag._unpack, []
+    monkeypatch.setattr(ros1_bag, "_unpack", lambda *a: unpacked.append(1) or unpack(*a))
+    file = ros1_bag.Ros1Bag(bag)
+    assert len(list(file.messages([TOPICS[CAM0]]))) == len(unpacked) == 10  # 4 GB are for any file
+    unpacked.clear()
+    monkeypatch.setattr(ros1_bag, "_SMALL_BYTES", 20_000_000)
+    line = r"walk\.bag: its chunks unpack to more than 20 MB, .*; .* rosbag decompress$"
+    with pytest.raises(DataError, match=line):
+        list(file.messages([TOPICS[CAM0]]))
+    assert len(unpacked) == 5
+
+
 def overlapping(original, path):
     """A bag whose chunks overlap in time: every fifth message, then those that follow these, and so on."""
     written = messages(original)

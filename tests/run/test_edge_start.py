@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import socket
+import time
+import urllib.request
 from contextlib import closing
 
 import pytest
 from helpers.children import Child
+from helpers.map_changes import small_map
 
 from share.config import Config
 from share.net.transport import bind
 from share.runtime.edge import EdgeRun
+from share.store.map_store import MapStore
+from share.store.schema import PAGE_BYTES
 
 
 def test_a_busy_status_port_ends_it_with_one_line(tmp_path):
@@ -35,6 +41,41 @@ def test_a_busy_port_releases_the_map(tmp_path):
     again.wait_for("listening on")
     assert again.interrupt() == 0
     assert "in use" not in again.said
+
+
+@pytest.mark.long
+def test_a_map_that_is_set_aside_at_the_start_is_said_until_it_is_moved_away(tmp_path):
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    content = bytearray(path.read_bytes())
+    content[3 * PAGE_BYTES : 5 * PAGE_BYTES] = bytes(2 * PAGE_BYTES)
+    path.write_bytes(content)
+    kept = path.with_name("room.sqlite.damaged-1")
+    for number, expected in enumerate(("degraded", "degraded", "ok")):
+        child = Child(
+            tmp_path / f"{number}.log",
+            *("edge", "--bind", "tcp://127.0.0.1:0", "--http", "127.0.0.1:0", "--map", str(path)),
+        )
+        page = child.wait_for(r"status at (http://\S+)")[1]
+        health = health_of_a_running(f"{page}health")
+        assert (health["status"], health["trouble"]) == (expected, [])
+        assert any(kept.name in line for line in health["degraded"]) == (expected == "degraded")
+        assert child.interrupt() == 0
+        if number == 1:
+            kept.unlink()
+
+
+def health_of_a_running(address):
+    """Return /health once the edge has reported: before, it knows no agents."""
+    deadline = time.monotonic() + 20
+    while True:
+        with urllib.request.urlopen(address, timeout=10) as answer:
+            health = json.load(answer)
+        if "waiting" in health:
+            return health
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize("http", ["nowhere", "192.0.2.1:8080"])

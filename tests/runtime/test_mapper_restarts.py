@@ -23,6 +23,7 @@ from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
 from share.runtime.mapper_supervision import MapperRestarts
 from share.runtime.worker_process import END
 from share.store.map_store import MapStore
+from share.store.schema import PAGE_BYTES
 
 
 class Link:
@@ -162,6 +163,7 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
 class Store:
     def __init__(self, load, writable=True):
         self.rows, self.writable, self.asides = load, writable, 0
+        self.path, self.problems, self.read_only_reason = Path("m"), (), "" if writable else "read-only"
 
     def set_aside(self):
         self.asides += 1
@@ -182,6 +184,47 @@ def test_a_map_that_cannot_be_interpreted_is_set_aside(error):
     assert store.asides == 1
     aside = f"the map file is renamed to m.damaged-1: {type(error).__name__}: {error}; a new one is started"
     assert said == [aside]
+
+
+def restarts_of(path):
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.05, print)
+        restarts.load_map()
+        return restarts.losses
+
+
+def test_a_damaged_map_stays_a_loss_until_its_copy_is_moved_away(path):
+    assert restarts_of(path) == []
+    content = bytearray(path.read_bytes())
+    content[3 * PAGE_BYTES : 5 * PAGE_BYTES] = bytes(2 * PAGE_BYTES)
+    path.write_bytes(content)
+    kept = "room.sqlite.damaged-1"
+    repaired = f"the file was damaged; it is kept as {kept}, and its intact rows were taken over"
+    assert restarts_of(path)[0] == f"map room.sqlite: {repaired}"
+    later = f"earlier files are kept as {kept}: see what they hold, move them away"
+    assert restarts_of(path) == [later]
+    path.with_name(kept).rename(path.with_name("seen"))
+    assert restarts_of(path) == []
+
+
+def test_a_long_list_of_kept_files_is_one_line(path):
+    for number in range(1, 6):
+        path.with_name(f"room.sqlite.damaged-{number}").touch()
+    (line,) = restarts_of(path)
+    assert "room.sqlite.damaged-3 and 2 more: " in line
+
+
+def test_a_map_that_was_set_aside_is_a_loss():
+    restarts = MapperRestarts(Store(raises(ValueError("x"))), 0.05, print)
+    restarts.load_map()
+    assert restarts.losses == ["the map file is renamed to m.damaged-1: ValueError: x; a new one is started"]
+
+
+def test_a_read_only_map_is_a_loss():
+    restarts = MapperRestarts(Store(raises(ValueError("x")), writable=False), 0.05, print)
+    assert restarts.losses == ["map m: read-only; nothing new is stored"]
+    restarts.load_map()
+    assert restarts.losses == ["the map file is no longer used: ValueError: x; nothing is saved"]
 
 
 def test_a_damaged_read_only_map_is_no_longer_used():

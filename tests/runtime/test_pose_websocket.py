@@ -22,6 +22,7 @@ from share.types import TrackState
 
 client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
 exceptions = pytest.importorskip("websockets.exceptions")
+bounded_websocket = pytest.importorskip("share.net.bounded_websocket")
 ORIGIN = "https://app.example"
 
 
@@ -138,6 +139,87 @@ def test_too_many_readers_are_refused_before_they_are_served(served):
         assert served._door.open_count == MAX_READERS
     with connected(served) as reader:  # the places are free again
         assert gets_poses(served, reader)
+
+
+def from_address(sink, address: str) -> socket.socket:
+    made = socket.socket()
+    made.bind((address, 0))
+    made.connect((sink.host.name, sink.host.port))
+    return made
+
+
+def is_disconnected(reader) -> bool:
+    """Whether a reader that is sent no more than a few messages is disconnected."""
+    with contextlib.suppress(TimeoutError):
+        for _ in range(5):
+            try:
+                reader.recv(timeout=5)
+            except exceptions.ConnectionClosed:
+                return True
+    return False
+
+
+def test_readers_of_one_machine_do_not_keep_out_those_of_another(served):
+    with contextlib.ExitStack() as stack:
+        first, *_ = [stack.enter_context(connected(served)) for _ in range(MAX_READERS)]
+        with client.connect(f"ws://{served.host}", sock=from_address(served, "127.0.0.2")) as other:
+            assert is_disconnected(first)
+            assert gets_poses(served, other)
+            assert served._door.open_count == MAX_READERS
+        with connected(served), pytest.raises(exceptions.InvalidStatus, match="503"):
+            client.connect(f"ws://{served.host}", proxy=None)  # nobody else of its own address goes
+
+
+def test_a_reader_that_has_long_read_gives_its_place_to_a_newcomer(served, monkeypatch):
+    """Sixteen that read and answer and never leave held all places for ever."""
+    with contextlib.ExitStack() as stack:
+        first, second, *_ = [stack.enter_context(connected(served)) for _ in range(MAX_READERS)]
+        monkeypatch.setattr(bounded_websocket, "SURE_S", 0.0)
+        with client.connect(f"ws://{served.host}", proxy=None) as newcomer:
+            assert is_disconnected(first)
+            assert gets_poses(served, newcomer) and gets_poses(served, second)
+            assert served._door.open_count == MAX_READERS
+
+
+def test_a_reader_that_answers_no_ping_is_disconnected(monkeypatch):
+    monkeypatch.setattr(bounded_websocket, "PING_S", 0.3)
+    request = "GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    request += "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    with contextlib.closing(PoseWebSocket("ws://127.0.0.1:0", "ann")) as server, connected(server) as polite:
+        with socket.create_connection((server.host.name, server.host.port), timeout=10) as silent:
+            silent.sendall(request.encode())
+            received = b""
+            with contextlib.suppress(ConnectionError):
+                while data := silent.recv(1024):
+                    received += data
+            assert received.startswith(b"HTTP/1.1 101 ") and b"\x89\x04" in received  # a PING
+        assert gets_poses(server, polite)
+
+
+MINUTE = bounded_websocket.SURE_S
+
+
+@pytest.mark.parametrize(
+    ("places", "newcomer", "freed"),
+    [
+        ([("a", 0.0)] * 3, "b", 0),  # three to none
+        ([("a", 2.0), ("a", 1.0), ("b", 0.0)], "b", None),  # two to one: no fairer the other way round
+        ([("b", 0.0), ("a", 2.0), ("a", 1.0), ("a", 3.0)], "b", 2),  # the oldest of who has most
+        ([("a", 1.0), ("a", 0.5)], "a", None),
+        ([("a", 1.0), ("a", 9.0 - MINUTE)], "a", 1),
+        ([("a", 9.0 - MINUTE), ("b", 8.0 - MINUTE)], "c", 1),
+        ([], "a", None),
+    ],
+)
+def test_whose_place_a_newcomer_takes(places, newcomer, freed):
+    assert bounded_websocket.place_to_free(places, newcomer, now_s=9.0) == freed
+
+
+def test_one_ipv6_peer_is_one_holder():
+    holder = bounded_websocket._holder_of
+    assert holder(("2001:db8::1", 1, 0, 0)) == holder(("2001:db8::ff:1", 2, 0, 0))
+    assert holder(("2001:db8::1", 1, 0, 0)) != holder(("2001:db8:0:1::1", 1, 0, 0))
+    assert holder(("fe80::1%eth0", 1, 0, 2)) and holder(("10.0.0.7", 1)) == "10.0.0.7" and holder(None) == ""
 
 
 @pytest.mark.parametrize("frame", [b"\x89\x80\0\0\0\0", b"\x81\x80\0\0\0\0"], ids=["ping", "text"])

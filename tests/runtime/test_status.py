@@ -108,6 +108,7 @@ def test_health_lists_present_agents():
     expected = {
         "status": "ok",
         "trouble": [],
+        "degraded": [],
         "agent_trouble": [],
         "refused": [],
         "agents": ["ann"],
@@ -140,6 +141,18 @@ def test_trouble_makes_health_503():
         status, _, body = get(server, "/health")
     assert status == 503
     assert json.loads(body)["status"] == "trouble" and json.loads(body)["trouble"] == trouble
+
+
+def test_a_map_that_was_set_aside_is_degraded_but_no_reason_to_restart_the_edge():
+    line = "the map file is renamed to room.sqlite.damaged-1: ValueError: x; a new one is started"
+    for trouble, expected in (([], (200, "degraded")), (["the disk is full"], (503, "trouble"))):
+        with serving(lambda t=trouble: {**REPORT, "trouble": t, "degraded": [line]}) as server:
+            status, _, body = get(server, "/health")
+            samples = metrics(get(server, "/metrics")[2])
+            assert get(server, "/health/agents")[0] == expected[0]
+        health = json.loads(body)
+        assert ((status, health["status"]), health["degraded"]) == (expected, [line])
+        assert samples["share_edge_degraded", frozenset()] == 1
 
 
 def test_an_agents_trouble_is_trouble_but_no_reason_to_restart_the_edge():
@@ -219,7 +232,7 @@ def test_metrics_that_the_report_lacks_are_omitted():
 
 
 def test_every_metric_has_a_value_in_a_real_report():
-    body, _ = edge_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": []})
+    body, _ = edge_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": [], "degraded": []})
     names = {name for name, _ in metrics(body)}
     absent = {row.name for row in edge_metrics.METRICS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}

@@ -6,6 +6,7 @@ import http.client
 import os
 import pickle
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
@@ -178,6 +179,55 @@ def test_a_viewer_that_grows_too_large_is_started_again(monkeypatch: pytest.Monk
         monkeypatch.setattr(viewer, "MAX_BYTES", 2**20)
         assert soon(lambda: bool(told))
         assert told[0] == "the live room has ended (it took more than 1 MB of memory) and starts again in 1 s"
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_viewer_that_hangs_is_killed_told_and_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever feeds it never waits, though the pipe is full."""
+    told: list[str] = []
+    with closing(LiveRoom("0", None, "test", told.append)) as room:
+        show_agent(room)
+        with browser(room.endpoint) as connection:
+            assert seen(connection, "/points/0/0")
+        pid = room.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        for stamp_ns in range(20_000):
+            room.feed.add_event(ev.PoseShown("ann-1", TrackState.OK, 0, np.eye(4), float(stamp_ns)))
+        assert room.pid == pid and not told  # all that, before anybody has noticed
+        monkeypatch.setattr(viewer, "MAX_SILENT_LOOKS", 3)
+        os.kill(pid, signal.SIGCONT)
+        assert not soon(lambda: bool(told), within_s=5.0)  # a heartbeat comes
+        os.kill(pid, signal.SIGSTOP)
+        assert soon(lambda: not room.is_alive)
+        assert soon(lambda: room.is_alive) and room.pid != pid
+        assert told == ["the live room has ended (it did not answer for 3 s) and starts again in 1 s"]
+        with browser(room.endpoint) as connection:
+            assert seen(connection, "/points/0/0")
+
+
+@needs_viser
+@pytest.mark.long
+def test_a_thread_that_serves_no_browser_stops_the_heartbeat() -> None:
+    from share.net.http_guard import HttpGuard, listen
+    from share.net.transport import Address
+    from share.view.window import Window
+
+    listener, bound = listen(Address("127.0.0.1", 0))
+    with closing(listener):
+        window = Window(listener, HttpGuard(bound), "test")
+        try:
+            loop = window._server._event_loop
+            assert soon(window.has_served)
+            hangs = threading.Event()
+            loop.call_soon_threadsafe(hangs.wait)
+            window.has_served()
+            assert not soon(window.has_served, within_s=0.5)
+            hangs.set()
+            assert soon(window.has_served)
+        finally:
+            window.stop()
 
 
 def camera(**changed: Any) -> bytes:

@@ -1,7 +1,8 @@
 """Read an untrusted ROS 1 bag (`.bag`, format 2.0) by rosbags, its messages converted to ROS 2's CDR.
 
 rosbags unpacks chunks whatever they grow to, reads as much as a length says, and where chunks overlap in time
-unpacks one for each message. Here sizes and lengths are bounded, and each chunk is unpacked once.
+unpacks one for each message. Here sizes and lengths are bounded, and each chunk is unpacked once. As bz2
+makes a millionth of zeros, what is unpacked altogether is bounded by the size of the file, too.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from share.recordings.mcap.file import MAX_CHUNK_BYTES, MAX_HELD_BYTES, BoundedF
 from share.recordings.message_file import MessageFile, Messages, Topic
 from share.types import I64
 
+_MAX_RATIO = 256  # unpacked bytes of all chunks to those of the file; of lz4 they are never more
+_SMALL_BYTES = 4_000 * MB  # that may be unpacked of any file
 _MAX_SKIPPED = 16  # connection records before a message, which its index points to
 _MAX_HEADER_BYTES = 10_000  # of a record in a chunk: a topic's name is the longest part
 
@@ -57,9 +60,10 @@ class Ros1Bag(MessageFile):
         channels = self.channels(topics)
         if not channels:
             return
+        max_unpacked = max(_SMALL_BYTES, _MAX_RATIO * self.path.stat().st_size)
         with self._opened() as reader:
             kinds = {one.id: one.msgtype for one in reader.connections}
-            for stamp_ns, id, data in _stored_messages(reader, channels, start_ns, end_ns):
+            for stamp_ns, id, data in _stored_messages(reader, channels, start_ns, end_ns, max_unpacked):
                 try:
                     cdr = bytes(ros.typestore().ros1_to_cdr(data, kinds[id]))
                 except _conversion_errors() as error:
@@ -111,11 +115,12 @@ class _RegularFile:
 
 
 def _stored_messages(
-    reader: Any, channels: Collection[int], start_ns: int, end_ns: int
+    reader: Any, channels: Collection[int], start_ns: int, end_ns: int, max_unpacked: int
 ) -> Iterator[tuple[int, int, bytes]]:
     """Yield log time ns, channel and data of the messages within [start_ns, end_ns), by time.
 
-    Raises ValueError where chunks overlap in time so much that more than MAX_HELD_BYTES wait for their turn.
+    Raises ValueError where chunks overlap in time so much that more than MAX_HELD_BYTES wait for their turn,
+    DataError where they unpack to more than `max_unpacked` bytes.
     """
     wanted: dict[int, list[tuple[int, int, int]]] = {}  # time, offset, channel, by place of the chunk
     for id in channels:
@@ -125,7 +130,7 @@ def _stored_messages(
     # chunks and messages by time, then by place in the file
     waiting = [(min(entries)[0], place, -1, -1, b"") for place, entries in wanted.items()]
     heapq.heapify(waiting)
-    held_bytes = 0
+    held_bytes = unpacked_bytes = 0
     while waiting:
         time_ns, place, offset, id, data = heapq.heappop(waiting)
         if offset >= 0:
@@ -133,6 +138,11 @@ def _stored_messages(
             yield time_ns, id, data
             continue
         chunk = _read_chunk(reader, place)
+        if (unpacked_bytes := unpacked_bytes + len(chunk.getbuffer())) > max_unpacked:
+            raise DataError(
+                f"{reader.path}: its chunks unpack to more than {max_unpacked / MB:,.0f} MB, hundreds of "
+                "times its size; if it is meant so, unpack it first: rosbag decompress"
+            )
         for time_ns, offset, id in wanted.pop(place):
             data = _message_data(chunk, offset, id, time_ns)
             if (held_bytes := held_bytes + len(data)) > MAX_HELD_BYTES:
@@ -149,7 +159,7 @@ def _check_places(chunks: Iterable[Any]) -> None:
         end = chunk.datapos + chunk.datasize
 
 
-def _read_chunk(reader: Any, place: int) -> BinaryIO:
+def _read_chunk(reader: Any, place: int) -> BytesIO:
     """Return an unpacked chunk. Raises ValueError if it is too large."""
     from rosbags.rosbag1.reader import read_bytes
 
