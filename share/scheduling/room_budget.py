@@ -2,8 +2,9 @@
 
 The air is a server whose turns all agents share, so a keyframe that alone takes T s takes T / (1 - load)
 (M/G/1 with processor sharing: L. Kleinrock, *Queueing Systems* II, 1976, section 4.4). T follows from what is
-measured, A, the time that keyframes take, and L, how many a second arrive: T = A / (1 + A L). It does not
-depend on the load, so rates that follow from it do not swing.
+measured, A, the time that keyframes take, and what arrives a second: L keyframes, and M small messages of
+c + k T each. The load is L T + M (c + k T), so T = A (1 - M c) / (1 + A (L + k M)). It does not depend on the
+load, so rates that follow from it do not swing.
 
 Where keyframes at the rates that all want take longer than a wearer notices, every agent begins with its
 least rate. What is left goes in small steps to whom a step gains most for its air, as long as nobody notices;
@@ -29,7 +30,9 @@ JOINING_HZ = 1.0  # Hz, of an agent that is alone in its map
 SLOW_START_HZ = 2.0  # Hz, of an agent that sends its first keyframes
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
-POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
+# air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a keyframe's
+_MESSAGE_S, _MESSAGE_PART = 3e-4, 0.006
+_OTHER_HZ = 8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
 MAX_LOAD = 0.95  # beyond, the formula has no meaning
@@ -61,6 +64,11 @@ class AgentAir:
     def elsewhere_ms(self) -> float:
         """Part of the delay that is not the air's, ms."""
         return max(0.0, self.delay_ms - 1e3 * self.keyframe_s)
+
+    @property
+    def messages_hz(self) -> float:
+        """Its small messages a second."""
+        return self.pose_hz + _OTHER_HZ
 
     @property
     def least_hz(self) -> float:
@@ -107,12 +115,23 @@ class RoomBudget:
 
     def air_s(self, agent: AgentAir) -> float:
         """Return T of an agent, s."""
-        return agent.keyframe_s / (1 + agent.keyframe_s * self._keyframes_hz)
+        return agent.keyframe_s * self._idle / (1 + agent.keyframe_s * self._keyframes_hz)
+
+    @property
+    def load(self) -> float:
+        """Part of the air in use, at most MAX_LOAD."""
+        usual_s = self.usual_air_s or 0.0
+        return min(MAX_LOAD, 1 - self._idle + usual_s * self._keyframes_hz)
 
     @cached_property
     def _keyframes_hz(self) -> float:
-        """L, with poses as the keyframes whose air they take."""
-        return sum(a.hz + POSE_COST * a.pose_hz for a in self.agents.values())
+        """L + k M."""
+        return sum(a.hz + _MESSAGE_PART * a.messages_hz for a in self.agents.values())
+
+    @cached_property
+    def _idle(self) -> float:
+        """1 - M c, bounded where an agent claims what no air carries."""
+        return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
     @property
     def usual_air_s(self) -> float | None:
@@ -129,6 +148,16 @@ class RoomBudget:
         """Return what every agent may send where the air is short."""
         rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
+
+
+def message_s(keyframe_s: float) -> float:
+    """Return how long a small message takes on the air on which a keyframe takes keyframe_s."""
+    return _MESSAGE_S + _MESSAGE_PART * keyframe_s
+
+
+def least_load(form: AgentKind, keyframe_s: float) -> float:
+    """Return the load of an agent that sends as little as it may."""
+    return LEAST_HZ[form] * keyframe_s + (SCARCE_POSE_HZ[form] + _OTHER_HZ) * message_s(keyframe_s)
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
@@ -152,7 +181,7 @@ class _Prediction:
         self._usual_air_s = budget.usual_air_s or 0.0
         forms = [agent.terms.form for agent in agents]
         pose_hz = np.array([SCARCE_POSE_HZ[form] if is_thinned else FULL_POSE_HZ for form in forms])
-        self._pose_load = POSE_COST * float(pose_hz @ self._air_s)
+        self._message_load = float((pose_hz + _OTHER_HZ) @ (_MESSAGE_S + _MESSAGE_PART * self._air_s))
         self._weight = np.array([_WEIGHT[form] for form in forms])
         is_headset = np.array([form is AgentKind.AR for form in forms])
         self._comes_first = is_headset | ~is_headset.any()  # others may be delayed for it
@@ -187,7 +216,7 @@ class _Prediction:
         return dict(zip(self._names, hz.tolist(), strict=True))
 
     def _load(self, hz: F64) -> float:
-        return float(self._capped(self._pose_load + hz @ self._air_s))
+        return float(self._capped(self._message_load + hz @ self._air_s))
 
     def _capped(self, load: F64 | float) -> F64:
         return np.minimum(load, MAX_LOAD)

@@ -15,7 +15,7 @@ from share.wire.messages import Evaluation
 _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 _STARTING_NS = 10_000_000_000  # after this time an agent without keyframes no longer reserves a share
-_STARTING_LOAD = 0.5  # of the air, for all that begin
+_STARTING_LOAD = 0.5  # of the air that is free, for all that begin
 _PLENTY = 0.75  # of what is noticed: less, and the air is no longer short
 _STEP_HZ = 0.25  # rise per period of a rate that was reduced
 
@@ -37,14 +37,17 @@ class RoomController:
     def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
         """Return what an agent may send whose air is not known: its part of what all that begin have."""
         self._starting = {n: at for n, at in self._starting.items() if now_ns - at < _STARTING_NS}
-        air_s = self._budget.usual_air_s or UNKNOWN_KEYFRAME_S
-        hz = _STARTING_LOAD / (air_s * max(1, len(self._starting)))
-        return first_grant(form, hz)
+        return first_grant(form, _STARTING_LOAD / (self._keyframe_s * max(1, len(self._starting))))
 
     def hold_ms(self, name: str, now_ns: int) -> float:
         """Return how long an agent that joins now holds its keyframes, ms."""
         self._starting[name] = now_ns
-        return self._start.hold_ms(self._budget.usual_air_s, now_ns)
+        return self._start.hold_ms(self._keyframe_s / _STARTING_LOAD, now_ns)
+
+    @property
+    def _keyframe_s(self) -> float:
+        """How long a keyframe of an agent that begins takes beside what others send, s."""
+        return (self._budget.usual_air_s or UNKNOWN_KEYFRAME_S) / (1 - self._budget.load)
 
     def grant(
         self,
