@@ -47,8 +47,10 @@ class TokenBucket:
         self._refilled_ns: int | None = None
 
     def set_rate(self, hz: float | None, now_ns: int) -> None:
-        """Set a new rate; saved tokens stay."""
+        """Set a new rate; saved tokens stay, but where nothing was limited there are none."""
         self._refill(now_ns)
+        if self.hz is None and hz is not None:
+            self._tokens = 0.0
         self.hz = hz
 
     def take(self, now_ns: int, preferred: bool = True, cost: float = 1.0) -> bool:

@@ -312,6 +312,7 @@ class Agent:
             self._connection.is_connected = False  # the edge has restarted and does not know us: hello
             return
         self._pings.measure(pong, self._now_ns)
+        self._ledger.record_answer(pong.sent_ns)
 
     # ------------------------------------------------------------ messages to the edge
 

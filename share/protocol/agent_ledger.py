@@ -15,7 +15,7 @@ from share.timing import seconds_to_ns
 from share.types import F64, Keyframe, KeyframeCandidate
 from share.wire.messages import Ack, Welcome
 
-RESEND_S = 1.0  # first wait for an acknowledgement; doubles with each resend
+RESEND_S = 1.0  # first wait for an acknowledgement, at least; doubles with each resend
 RESEND_MAX_S = 8.0  # longest wait
 GAP_RESEND_S = 0.1  # first wait for a keyframe that later ones have overtaken
 
@@ -38,7 +38,9 @@ class LedgerEntry:
 class KeyframeLedger:
     """Keyframes in order of their ids: first those acknowledged, then those pending.
 
-    Only the first `window` pending ones are in flight. A full ledger drops the oldest acknowledged one
+    Only the first `window` pending ones are in flight. One is sent again once the edge has answered something
+    that was sent after it: a link keeps the order, so until then it is on its way, and to send it twice would
+    fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896). A full ledger drops the oldest acknowledged one
     (policy drop_oldest_acknowledged); without one, the oldest pending one (drop_oldest), and rebases the next
     keyframe onto the dropped one's reference. `counts` has both, by name.
     """
@@ -52,6 +54,7 @@ class KeyframeLedger:
         self._buffered_at_edge = frozenset[int]()
         self._max_sent_id = -1  # highest id sent in this session of the edge
         self._max_ever_sent_id = -1  # in any session
+        self._heard_before_ns = -1  # what was sent before, the edge has, or it was lost
 
     def __len__(self) -> int:
         return len(self._acknowledged) + len(self._pending)
@@ -120,6 +123,10 @@ class KeyframeLedger:
         self._max_ever_sent_id = max(self._max_ever_sent_id, self._max_sent_id)
         return due
 
+    def record_answer(self, sent_ns: int) -> None:
+        """Record that the edge has answered a message, such as a ping, sent at `sent_ns`."""
+        self._heard_before_ns = max(self._heard_before_ns, sent_ns)
+
     def record_send_failure(self, keyframe: int) -> None:
         """Record that the link did not take this keyframe. It is due again after its backoff."""
         if (entry := self.find(keyframe)) is not None and entry.send_count:
@@ -158,6 +165,7 @@ class KeyframeLedger:
         for entry in reversed(self.pending[: self._window]):
             if entry.keyframe.id in self._buffered_at_edge:
                 arrived_ns = max(entry.sent_ns, arrived_ns or entry.sent_ns)
+                self.record_answer(entry.sent_ns + 1)  # keyframes of one moment are sent in order
             elif entry.attempts and arrived_ns is not None and arrived_ns >= entry.sent_ns:
                 entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds_to_ns(GAP_RESEND_S))
 
@@ -188,7 +196,7 @@ class KeyframeLedger:
     def _is_due(self, entry: LedgerEntry, now_ns: int) -> bool:
         if entry.keyframe.id in self._buffered_at_edge and entry.keyframe.id != next(iter(self._pending)):
             return False  # not for the oldest: the edge may wait for a keyframe that was dropped here
-        return entry.due_ns is None or entry.due_ns <= now_ns
+        return entry.due_ns is None or (entry.due_ns <= now_ns and entry.sent_ns < self._heard_before_ns)
 
     def _make_all_due(self) -> None:
         self._buffered_at_edge = frozenset()

@@ -11,7 +11,6 @@ from share.scheduling.room_budget import RateGrant
 from share.timing import RingBuffer
 from share.types import AgentKind
 
-LOW_QOE = 0.5  # share of its target below which a QoE is low
 _MAX_SERIES = 5000  # newest evaluations of an agent in a report: an hour at more than one a second
 
 
@@ -39,13 +38,11 @@ class RateScheduler:
         self._is_full = False
         self._history: dict[str, RingBuffer] = {}  # of all runs of a name
         self._latest: dict[str, RatedEvaluation] = {}  # of the present run
-        self._low_since_s: dict[str, float] = {}  # of the present run, while its QoE is low
 
     def begin_run(self, agent: str) -> None:
         """Start a new run of an agent, without a limit until its first evaluation."""
         self._policy.forget(agent)
         self._latest.pop(agent, None)
-        self._low_since_s.pop(agent, None)
 
     def forget(self, agent: str) -> None:
         """Drop all state and history of a name."""
@@ -83,12 +80,7 @@ class RateScheduler:
         delay. t_s: time for the report."""
         grant, evaluation = self._policy.evaluate(agent, report), report.evaluation
         delay_ms, error_cm, track_ms = evaluation.delay_ms, evaluation.error_cm, evaluation.track_ms
-        parameters = QoeParameters.from_config(self._config, report.kind, agent)
-        value = qoe(delay_ms, error_cm, parameters)
-        if value < LOW_QOE * parameters.target:
-            self._low_since_s.setdefault(agent, t_s)
-        else:
-            self._low_since_s.pop(agent, None)
+        value = qoe(delay_ms, error_cm, QoeParameters.from_config(self._config, report.kind, agent))
         comm_ms = max(0.0, delay_ms - track_ms - comp_ms)
         rate_hz = None if grant is None else grant.hz
         fields = t_s, delay_ms, error_cm, value, rate_hz, track_ms, comm_ms, comp_ms
@@ -98,17 +90,14 @@ class RateScheduler:
         return grant
 
     def report(self, agent: str | None, kind: AgentKind) -> dict[str, float | None]:
-        """Return what edge.json has of an agent's present run; None: no run. qoe_low_s: how long its QoE has
-        been below half of its target."""
+        """Return what edge.json has of an agent's present run; None: no run."""
         rated = None if agent is None else self._latest.get(agent)
-        low_since_s = None if agent is None else self._low_since_s.get(agent)
-        low_s = 0.0 if rated is None or rated.t_s is None or low_since_s is None else rated.t_s - low_since_s
         newest = {
             name: None if rated is None else getattr(rated, name)
             for name in ("rate_hz", "qoe", "delay_ms", "error_cm")
         }
         target = QoeParameters.from_config(self._config, kind, agent or "").target
-        return {**newest, "qoe_target": target, "qoe_low_s": round(low_s, 3)}
+        return {**newest, "qoe_target": target}
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""

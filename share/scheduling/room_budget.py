@@ -2,12 +2,14 @@
 
 The air is a server whose turns all agents share, so a keyframe that alone takes T s takes T / (1 - load)
 (M/G/1 with processor sharing: L. Kleinrock, *Queueing Systems* II, 1976, section 4.4). T follows from what is
-measured, A, the time that keyframes take, and L, how many a second arrive: T = A / (1 + A L). It does not
-depend on the load, so rates that follow from it do not swing.
+measured, A, the time that keyframes take, and what arrives a second: L keyframes, and M small messages of
+c + k T each. The load is L T + M (c + k T), so T = A (1 - M c) / (1 + A (L + k M)). It does not depend on the
+load, so rates that follow from it do not swing.
 
-Where keyframes at the rates that all want take longer than a wearer notices, every agent begins with its
-least rate. What is left goes in small steps to whom a step gains most for its air, as long as nobody notices;
-then only where a step gains a headset more QoE than the delay that it causes costs all.
+Where keyframes at the rates that all want would wait for each other for more than `FREE_WAIT_MS`, every agent
+begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as long as
+they wait for less; then only where a step gains a headset more QoE than the delay that it causes costs all. What
+a keyframe takes alone on slow air, no rate changes, so it does not count.
 """
 
 from __future__ import annotations
@@ -21,19 +23,23 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, QoeTable
+from share.scheduling.qoe import QoeParameters, QoeTable
 from share.types import F64, AgentKind
 
 LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
 JOINING_HZ = 1.0  # Hz, of an agent that is alone in its map
 SLOW_START_HZ = 2.0  # Hz, of an agent that sends its first keyframes
+FREE_WAIT_MS = 5.0  # a quarter of the delay that a wearer notices
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
-POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
+# air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a keyframe's
+_MESSAGE_S, _MESSAGE_PART = 3e-4, 0.006
+OTHER_HZ = 8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
 MAX_LOAD = 0.95  # beyond, the formula has no meaning
 _STEP_HZ = 0.25
+_HELD = 1.5  # how much more a step must gain another agent than one that has it already
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
 _LEAST_AIR_S = 1e-3
@@ -61,6 +67,11 @@ class AgentAir:
     def elsewhere_ms(self) -> float:
         """Part of the delay that is not the air's, ms."""
         return max(0.0, self.delay_ms - 1e3 * self.keyframe_s)
+
+    @property
+    def messages_hz(self) -> float:
+        """Its small messages a second."""
+        return self.pose_hz + OTHER_HZ
 
     @property
     def least_hz(self) -> float:
@@ -107,12 +118,23 @@ class RoomBudget:
 
     def air_s(self, agent: AgentAir) -> float:
         """Return T of an agent, s."""
-        return agent.keyframe_s / (1 + agent.keyframe_s * self._keyframes_hz)
+        return agent.keyframe_s * self._idle / (1 + agent.keyframe_s * self._keyframes_hz)
+
+    @property
+    def load(self) -> float:
+        """Part of the air in use, at most MAX_LOAD."""
+        usual_s = self.usual_air_s or 0.0
+        return min(MAX_LOAD, 1 - self._idle + usual_s * self._keyframes_hz)
 
     @cached_property
     def _keyframes_hz(self) -> float:
-        """L, with poses as the keyframes whose air they take."""
-        return sum(a.hz + POSE_COST * a.pose_hz for a in self.agents.values())
+        """L + k M."""
+        return sum(a.hz + _MESSAGE_PART * a.messages_hz for a in self.agents.values())
+
+    @cached_property
+    def _idle(self) -> float:
+        """1 - M c, bounded where an agent claims what no air carries."""
+        return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
     @property
     def usual_air_s(self) -> float | None:
@@ -121,14 +143,28 @@ class RoomBudget:
         times = [self.air_s(agent) for agent in self.agents.values()]
         return None if not times else median(times) if len(times) > 2 else min(times)
 
-    def is_short(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
-        """Whether not everyone can send what it wants with less than `noticed_ms` on the air."""
-        return _Prediction(self, is_thinned=False).is_noticed(noticed_ms)
+    def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
+        """Whether not everyone can send what it wants with a wait of less than `wait_ms` for others."""
+        return _Prediction(self, is_thinned=False).waits(wait_ms)
 
-    def allocate(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
-        """Return what every agent may send where the air is short."""
-        rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
+    def allocate(
+        self, wait_ms: float = FREE_WAIT_MS, before: Mapping[str, RateGrant] | None = None
+    ) -> dict[str, RateGrant]:
+        """Return what every agent may send where the air is short. before: what they have, which changes hands
+        only for a much larger gain."""
+        held_hz = np.array([before[n].hz if before and n in before else 0.0 for n in self.agents])
+        rates = _Prediction(self, is_thinned=True).allocate(wait_ms, held_hz)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
+
+
+def message_s(keyframe_s: float) -> float:
+    """Return how long a small message takes on the air on which a keyframe takes keyframe_s."""
+    return _MESSAGE_S + _MESSAGE_PART * keyframe_s
+
+
+def least_load(form: AgentKind, keyframe_s: float) -> float:
+    """Return the load of an agent that sends as little as it may."""
+    return LEAST_HZ[form] * keyframe_s + (SCARCE_POSE_HZ[form] + OTHER_HZ) * message_s(keyframe_s)
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
@@ -152,7 +188,7 @@ class _Prediction:
         self._usual_air_s = budget.usual_air_s or 0.0
         forms = [agent.terms.form for agent in agents]
         pose_hz = np.array([SCARCE_POSE_HZ[form] if is_thinned else FULL_POSE_HZ for form in forms])
-        self._pose_load = POSE_COST * float(pose_hz @ self._air_s)
+        self._message_load = float((pose_hz + OTHER_HZ) @ (_MESSAGE_S + _MESSAGE_PART * self._air_s))
         self._weight = np.array([_WEIGHT[form] for form in forms])
         is_headset = np.array([form is AgentKind.AR for form in forms])
         self._comes_first = is_headset | ~is_headset.any()  # others may be delayed for it
@@ -164,18 +200,19 @@ class _Prediction:
         self._drift_cm = np.minimum([agent.drift_cm for agent in agents], self._error_cm)
         self._measured_hz = np.maximum([agent.hz for agent in agents], 1e-3)
 
-    def is_noticed(self, noticed_ms: float) -> bool:
-        """Return whether keyframes at the wanted rates take longer on the air than a wearer notices."""
-        return bool(self._is_noticed(self._load(self._wanted_hz), noticed_ms))
+    def waits(self, wait_ms: float) -> bool:
+        """Return whether keyframes at the wanted rates wait for others for longer."""
+        return bool(self._waits(self._load(self._wanted_hz), wait_ms))
 
-    def allocate(self, noticed_ms: float) -> dict[str, float]:
-        """Return the rates, Hz: least ones, then steps to whom they gain most; while nobody notices, those of
+    def allocate(self, wait_ms: float, held_hz: F64) -> dict[str, float]:
+        """Return the rates, Hz: least ones, then steps to whom they gain most; while waits are short, those of
         who comes first before those of others."""
         hz = self._least_hz.copy()
         while len(hz) and (load := self._load(hz)) < MAX_LOAD:
             is_open = hz + _STEP_HZ <= self._wanted_hz
             gain = self._gain(hz, load) / np.maximum(self._air_s, 1e-6)
-            is_free = is_open & ~self._is_noticed(self._capped(load + _STEP_HZ * self._air_s), noticed_ms)
+            gain *= np.where(hz + _STEP_HZ <= held_hz, _HELD, 1.0)
+            is_free = is_open & ~self._waits(self._capped(load + _STEP_HZ * self._air_s), wait_ms)
             steps = is_free & self._comes_first
             if not steps.any():
                 steps = is_free
@@ -187,13 +224,15 @@ class _Prediction:
         return dict(zip(self._names, hz.tolist(), strict=True))
 
     def _load(self, hz: F64) -> float:
-        return float(self._capped(self._pose_load + hz @ self._air_s))
+        return float(self._capped(self._message_load + hz @ self._air_s))
 
     def _capped(self, load: F64 | float) -> F64:
         return np.minimum(load, MAX_LOAD)
 
-    def _is_noticed(self, load: F64 | float, noticed_ms: float) -> NDArray[np.bool_]:
-        return np.asarray(self._usual_air_s / (1 - np.asarray(load)) > noticed_ms / 1e3)
+    def _waits(self, load: F64 | float, wait_ms: float) -> NDArray[np.bool_]:
+        """Return whether a keyframe waits for others for longer: T / (1 - load) - T."""
+        part = np.asarray(load)
+        return np.asarray(1e3 * self._usual_air_s * part / (1 - part) > wait_ms)
 
     def _gain(self, hz: F64, load: float) -> F64:
         """Return what a step of its rate gains each agent (N,), weighted, at the same load."""

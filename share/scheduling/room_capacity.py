@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from share.scheduling.room_budget import LEAST_HZ, MAX_LOAD, POSE_COST, SCARCE_POSE_HZ, RoomBudget
+from share.scheduling.room_budget import MAX_LOAD, RoomBudget, least_load
 from share.timing import seconds_to_ns
 from share.types import AgentKind
 
@@ -72,7 +72,7 @@ def headset_delay_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection
         return 0.0
     staying = [agent for name, agent in budget.agents.items() if name not in leaving]
     air_s = _lower_quartile(map(budget.air_s, budget.agents.values()))
-    load = air_s * sum(map(_least_hz, [joining, *(agent.terms.form for agent in staying)]))
+    load = sum(least_load(form, air_s) for form in [joining, *(agent.terms.form for agent in staying)])
     if load >= MAX_LOAD:
         return math.inf
     headsets = [agent for agent in staying if agent.terms.form is AgentKind.AR]
@@ -84,11 +84,6 @@ def _lower_quartile(values: Iterable[float]) -> float:
     """Return what three quarters of the agents report or exceed: few false reports remove none."""
     ordered = sorted(values)
     return ordered[(len(ordered) - 1) // 4]
-
-
-def _least_hz(form: AgentKind) -> float:
-    """Return keyframes a second of an agent at its least rate, poses included."""
-    return LEAST_HZ[form] + POSE_COST * SCARCE_POSE_HZ[form]
 
 
 def _is_settled(since_ns: int | None, now_ns: int) -> bool:

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters
-from share.scheduling.room_budget import SILENT_S, AgentAir, RateGrant, RoomBudget, first_grant
+from share.scheduling.qoe import QoeParameters
+from share.scheduling.room_budget import (
+    FREE_WAIT_MS,
+    SILENT_S,
+    AgentAir,
+    RateGrant,
+    RoomBudget,
+    first_grant,
+)
 from share.scheduling.room_capacity import RoomCapacity
 from share.scheduling.staggered_start import UNKNOWN_KEYFRAME_S, StaggeredStart
 from share.timing import seconds_to_ns
@@ -15,8 +22,8 @@ from share.wire.messages import Evaluation
 _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 _STARTING_NS = 10_000_000_000  # after this time an agent without keyframes no longer reserves a share
-_STARTING_LOAD = 0.5  # of the air, for all that begin
-_PLENTY = 0.75  # of what is noticed: less, and the air is no longer short
+_STARTING_LOAD = 0.5  # of the air that is free, for all that begin
+_PLENTY = 0.75  # of the free wait: less, and the air is no longer short
 _STEP_HZ = 0.25  # rise per period of a rate that was reduced
 
 
@@ -37,14 +44,17 @@ class RoomController:
     def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
         """Return what an agent may send whose air is not known: its part of what all that begin have."""
         self._starting = {n: at for n, at in self._starting.items() if now_ns - at < _STARTING_NS}
-        air_s = self._budget.usual_air_s or UNKNOWN_KEYFRAME_S
-        hz = _STARTING_LOAD / (air_s * max(1, len(self._starting)))
-        return first_grant(form, hz)
+        return first_grant(form, _STARTING_LOAD / (self._keyframe_s * max(1, len(self._starting))))
 
     def hold_ms(self, name: str, now_ns: int) -> float:
         """Return how long an agent that joins now holds its keyframes, ms."""
         self._starting[name] = now_ns
-        return self._start.hold_ms(self._budget.usual_air_s, now_ns)
+        return self._start.hold_ms(self._keyframe_s / _STARTING_LOAD, now_ns)
+
+    @property
+    def _keyframe_s(self) -> float:
+        """How long a keyframe of an agent that begins takes beside what others send, s."""
+        return (self._budget.usual_air_s or UNKNOWN_KEYFRAME_S) / (1 - self._budget.load)
 
     def grant(
         self,
@@ -88,12 +98,14 @@ class RoomController:
         """Allot the air anew. What it takes a little more or less changes nothing: once the air is short it
         counts as such until there is plenty, and a rate stands as long as it is not too much and there is no
         plenty for more."""
-        self._allocated_ns, plenty_ms = now_ns, _PLENTY * ACCEPTED_DELAY_MS
-        self._is_short = self._budget.is_short(plenty_ms if self._is_short else ACCEPTED_DELAY_MS)
+        self._allocated_ns, plenty_ms = now_ns, _PLENTY * FREE_WAIT_MS
+        self._is_short = self._budget.is_short(plenty_ms if self._is_short else FREE_WAIT_MS)
         if not self._is_short:
             self._grants = {n: RateGrant(agent.wanted_hz) for n, agent in self._budget.agents.items()}
             return
-        most, least, before = self._budget.allocate(), self._budget.allocate(plenty_ms), self._grants
+        before = self._grants
+        most = self._budget.allocate(before=before)
+        least = self._budget.allocate(plenty_ms, before)
         self._grants = {
             name: replace(grant, hz=min(grant.hz, max(least[name].hz, before.get(name, grant).hz)))
             for name, grant in most.items()

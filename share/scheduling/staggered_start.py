@@ -19,10 +19,10 @@ class StaggeredStart:
     def __init__(self) -> None:
         self._free_ns = 0  # when the air is done with the first keyframes that have a turn
 
-    def hold_ms(self, keyframe_s: float | None, now_ns: int) -> float:
-        """Give an agent that begins its turn, and return how far off that is, ms. keyframe_s: how long a
-        keyframe takes on the air; None: not measured yet."""
-        slot_s = UNKNOWN_KEYFRAME_S if keyframe_s is None else max(keyframe_s, _LEAST_SLOT_S)
+    def hold_ms(self, slot_s: float, now_ns: int) -> float:
+        """Give an agent that begins its turn, and return how far off that is, ms. slot_s: until the next
+        one's."""
+        slot_s = max(slot_s, _LEAST_SLOT_S)
         turn_ns = min(max(now_ns, self._free_ns), now_ns + seconds_to_ns(MAX_HOLD_S))
         self._free_ns = turn_ns + seconds_to_ns(min(slot_s, MAX_HOLD_S))
         return 1e3 * (turn_ns - now_ns) / SECOND_NS

@@ -6,7 +6,7 @@ import numpy as np
 
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
-from share.scheduling.room_budget import first_grant
+from share.scheduling.room_budget import OTHER_HZ, first_grant, message_s
 from share.scheduling.room_controller import RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
@@ -44,8 +44,9 @@ class Air:
         self.counts += [[k / len(kinds), 0.0] for k in range(len(kinds))]  # they do not send in step
 
     def load(self) -> float:
-        poses = sum(30.0 if g.pose_hz is None else g.pose_hz for g in self.grants)
-        return min(0.98, self.alone_ms / 1e3 * (sum(g.hz for g in self.grants) + 0.017 * poses))
+        alone_s = self.alone_ms / 1e3
+        messages_hz = sum(OTHER_HZ + (30.0 if g.pose_hz is None else g.pose_hz) for g in self.grants)
+        return min(0.98, alone_s * sum(g.hz for g in self.grants) + messages_hz * message_s(alone_s))
 
     def play(self, seconds: float) -> None:
         end = self.now_s + seconds

@@ -208,9 +208,24 @@ def test_the_window_moves_with_the_acknowledgements() -> None:
 
 def test_the_resend_interval_doubles() -> None:
     book = ledger(1)
-    times = [t for t in range(0, 40 * S, S // 10) if due(book, t)]
+    times = []
+    for t in range(0, 40 * S, S // 10):
+        times += [t] if due(book, t) else []
+        book.record_answer(t)
     assert np.diff(times).tolist() == [S, 2 * S, 4 * S, *[8 * S] * 4]
     assert (book.counts["sent"], book.counts["resent"]) == (1, 7)
+
+
+def test_what_is_still_on_its_way_is_not_sent_again() -> None:
+    """A link keeps the order: while what was sent later is not answered either, a keyframe waits in a queue."""
+    book = ledger(2)
+    assert due(book, S) == [0, 1]
+    book.record_answer(S)  # a ping, right before them
+    assert due(book, 20 * S) == []
+    book.acknowledge(Ack(1))
+    book.record_answer(S + S // 2)  # a ping that came after them
+    assert due(book, 20 * S) == [1]
+    assert due(book, 60 * S) == []  # the second one is on its way
 
 
 def test_a_gap_is_resent_soon_and_buffered_keyframes_are_not() -> None:
@@ -219,6 +234,7 @@ def test_a_gap_is_resent_soon_and_buffered_keyframes_are_not() -> None:
     book.acknowledge(Ack(1, (2, 3)))
     assert due(book, S // 20) == []  # it may still be on its way
     assert due(book, S // 10) == [1]
+    book.record_answer(S)  # a ping
     assert due(book, 2 * S) == []
     assert due(book, 2 * S + S // 10) == [1]
     book.acknowledge(Ack(4))
@@ -251,6 +267,7 @@ def test_a_gap_that_does_not_close_is_resent_soon_once_for_what_has_arrived_sinc
     due(book, 0)
     lost, buffered = [], (1, 2, 3)
     for now in range(S // 20, 20 * S, S // 20):
+        book.record_answer(now)  # a ping
         book.acknowledge(Ack(0, buffered))
         if now == 5 * S:
             book.add(entries(5)[4])  # it arrives: the second resend is lost too

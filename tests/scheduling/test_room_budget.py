@@ -19,6 +19,7 @@ from share.scheduling.room_budget import (
     RateGrant,
     RoomBudget,
     first_grant,
+    message_s,
 )
 from share.scheduling.room_controller import RoomController
 from share.types import F64, AgentKind
@@ -66,12 +67,12 @@ def test_where_the_air_is_short_robots_yield_and_poses_are_thinned() -> None:
 
 @pytest.mark.parametrize("alone_ms", [18.0, 34.0, 54.0])
 def test_rates_settle(alone_ms: float) -> None:
-    """Within 10 s, though every 0.5 s all react to what all did: headsets' stay, robots' move by two steps at
+    """Within 10 s, though every 0.5 s all react to what all did: headsets move by one step, robots by two at
     most."""
     air = Air(alone_ms, (AR, AR, ROBOT) * 4)
     air.play(60)
     for kind, rates in zip(air.kinds, zip(*air.history[20:], strict=True), strict=True):
-        assert max(rates) - min(rates) <= (0.0 if kind is AR else 0.5)
+        assert max(rates) - min(rates) <= (0.25 if kind is AR else 0.5)
 
 
 def test_after_the_air_clears_all_get_what_they_want_again() -> None:
@@ -84,10 +85,19 @@ def test_after_the_air_clears_all_get_what_they_want_again() -> None:
 
 
 def test_time_on_the_air_follows_from_what_is_measured_at_any_load() -> None:
+    """Small messages of the load included: poses, and what agent and edge say beside."""
     for load in (0.1, 0.5, 0.9):
-        keyframes_hz = load / 0.04
-        measured = agent(keyframe_ms=40 / (1 - load), hz=keyframes_hz, pose_hz=0.0)
+        messages = agent(pose_hz=5.0).messages_hz * message_s(0.04)
+        measured = agent(keyframe_ms=40 / (1 - load), hz=(load - messages) / 0.04, pose_hz=5.0)
         assert room(measured).air_s(measured) == pytest.approx(0.04)
+        assert room(measured).load == pytest.approx(load)
+
+
+def test_slow_air_that_few_share_is_not_short() -> None:
+    """At 15 Mbit/s a keyframe takes 18 ms, however few there are; at 5 Mbit/s one agent still has what it wants."""
+    assert not room(*[agent(keyframe_ms=18.5)] * 2).is_short()
+    assert room(*[agent(keyframe_ms=40.0)] * 12).is_short()
+    assert room(agent(keyframe_ms=54.0)).allocate()["a0"].hz == 1.5
 
 
 def test_more_goes_to_whom_it_gains_more() -> None:
