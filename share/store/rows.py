@@ -38,7 +38,14 @@ COLUMNS = {
 }
 
 _CREDENTIAL_PREFIX = "voice "  # before a run's key, a name in `about`; SHARE 0.1 ignores it
-_READABLE_VERSIONS = (3, 4, 5, 6, codec.WIRE_VERSION)  # wire versions with today's Hello and a known Keyframe
+_READABLE_VERSIONS = (
+    3,
+    4,
+    5,
+    6,
+    7,
+    codec.WIRE_VERSION,
+)  # wire versions with today's Hello and a known Keyframe
 _pack = msgspec.msgpack.encode
 _decode_frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _decode_pose_keys = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
