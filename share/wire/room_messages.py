@@ -27,6 +27,13 @@ class ObjectKind(StrEnum):
     MARKER = "marker"
 
 
+class Permission(StrEnum):
+    """What a client may do beside looking on: send robots; place, move and remove objects."""
+
+    COMMANDS = "commands"
+    OBJECTS = "objects"
+
+
 def _check_number(name: str, value: int) -> None:
     if not 0 <= value <= _MAX_NUMBER:
         raise ValueError(f"{name}: {value} is outside 0 .. {_MAX_NUMBER}")
