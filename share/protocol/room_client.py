@@ -41,6 +41,7 @@ class _OpenCommand:
     message: room.Goto | room.Cancel
     heard_ns: int
     sent_ns: int | None = None
+    is_repeated: bool = True
 
 
 class RoomClient:
@@ -96,7 +97,7 @@ class RoomClient:
             case ev.RequestWanted():
                 self._on_request(event.message)
             case ev.CommandWanted():
-                self._commands[event.message.command] = _OpenCommand(event.message, now_ns)
+                self._on_command(event.message)
             case ev.BridgeSaid():
                 self._send_if_connected(event.message)
             case ev.ClientEnded():
@@ -210,6 +211,16 @@ class RoomClient:
 
     # ------------------------------------------------------------ commands
 
+    def _on_command(self, message: room.Goto | room.Cancel) -> None:
+        if isinstance(message, room.Cancel):  # its own goals are repeated no longer
+            for one in self._commands.values():
+                is_goal = isinstance(one.message, room.Goto)
+                if is_goal and (
+                    one.message.robot == message.robot or None in (one.message.robot, message.robot)
+                ):
+                    one.is_repeated = False
+        self._commands[message.command] = _OpenCommand(message, self._now_ns)
+
     def _on_command_state(self, state: room.CommandState) -> None:
         is_own = state.commander in ("", self._hello.name)
         one = self._commands.get(state.command) if is_own else None
@@ -258,7 +269,7 @@ class RoomClient:
                 request.session = request.session or self._connection.sessions.session
                 self._send(request.message)
         for open_command in self._commands.values():
-            if self._is_due(open_command.sent_ns):
+            if open_command.is_repeated and self._is_due(open_command.sent_ns):
                 open_command.sent_ns = self._now_ns
                 self._send(open_command.message)
 
