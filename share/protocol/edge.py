@@ -28,6 +28,7 @@ from share.wire import messages as wire
 from share.wire.codec import decode, message_bytes
 from share.wire.room_messages import ClientHello
 
+_NO_SESSION = 0  # in a pong to a client that the edge has forgotten: it says hello again
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 
@@ -119,7 +120,8 @@ class Edge(RoomMembership):
                 self._on_hello(event, message)
             case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 times = message.sent_ns, self._out.now_ns, self._out.now_ns
-                self._out.send(event.peer_id, wire.Pong(message.sequence, *times, self._session))
+                session = _NO_SESSION if self.room.clients.was_removed(event.peer_id) else self._session
+                self._out.send(event.peer_id, wire.Pong(message.sequence, *times, session))
             case _ if client is not None:
                 self.room.on_message(event, client, message)
             case wire.Bye() if peer:

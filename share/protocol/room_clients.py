@@ -18,6 +18,7 @@ MAX_CLIENTS, MAX_OF_NAME = 64, 8
 _NEW_RUN_LIMIT = (8.0, 2.0)  # at once, and a second, of a name
 _REQUEST_LIMIT, _COMMAND_LIMIT, _STATE_LIMIT = (80.0, 40.0), (20.0, 10.0), (40.0, 20.0)  # of a name
 _MAX_REQUESTS, _MAX_COMMANDS = 64, 16  # of a client that are remembered
+_MAX_REMOVED = 256  # clients that are remembered
 _ANSWERED_S = 0.6  # a bridge that was silent for longer may be dead
 
 Downlink = Welcome | Refused | Pong | ClientDownlink | ClientUplink
@@ -67,6 +68,7 @@ class ClientRegistry:
     def __init__(self, out: EdgeOutput, silent_s: float) -> None:
         self._out, self._silent_s = out, silent_s
         self._clients: dict[bytes, Client] = {}
+        self._removed: dict[bytes, None] = {}  # for their silence, the oldest first
         self._new_runs = TokenBuckets(*_NEW_RUN_LIMIT)
         self.requests, self.commands = TokenBuckets(*_REQUEST_LIMIT), TokenBuckets(*_COMMAND_LIMIT)
         self.states = TokenBuckets(*_STATE_LIMIT)
@@ -115,6 +117,7 @@ class ClientRegistry:
             return f"too many new clients of '{hello.name}': try again in a second"
         client = Client(id=event.peer_id, hello=hello, last_received_ns=now_ns)
         self._clients[event.peer_id] = client
+        self._removed.pop(event.peer_id, None)
         what = "bridge of a robot" if hello.drives_robot else "client"
         self._out.record("client joined", None, f"{what}, '{hello.name}'")
         return client
@@ -129,6 +132,13 @@ class ClientRegistry:
         for client in self:
             if client.last_received_ns < limit_ns:
                 self.leave(client, f"no message for {self._silent_s:g} s")
+                self._removed[client.id] = None
+                if len(self._removed) > _MAX_REMOVED:
+                    del self._removed[next(iter(self._removed))]
+
+    def was_removed(self, peer_id: bytes) -> bool:
+        """Return whether a client was removed for its silence. It may think that it is still served."""
+        return peer_id in self._removed
 
 
 def permission_objection(name: str, permission: Permission, event: PeerMessageReceived) -> str | None:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from helpers.room_bench import Air, RoomBench, at
 
+from share.protocol import agent_events as ag
 from share.protocol import room_events as ev
 from share.protocol.room_objects import MAX_OBJECTS, MAX_OWNED
 from share.wire import room_messages as room
+from share.wire.codec import encode
 from share.wire.room_messages import ObjectKind, Permission
 
 MAP = "ann-1/0"
@@ -184,6 +186,17 @@ def test_a_client_that_has_seen_all_is_sent_nothing_more(bench) -> None:
     bench.run(5)
     pongs = bench.edge.room.clients.get(bench.bob).counts["bytes_down"] - before
     assert pongs == 0  # pongs count with the unjoined, as those of all pings
+
+
+def test_a_client_that_the_edge_forgot_without_its_knowing_joins_again(bench) -> None:
+    send, bench.deliver = bench.deliver, lambda peer, frames: None  # only the way up is broken
+    for _ in range(35):
+        bench.run(0.1)
+        bench.to_client(bench.ann, ag.EdgeMessageReceived(encode(room.ObjectList(7, 0))))
+    bench.deliver = send
+    assert bench.edge.room.clients.get(bench.ann) is None and bench.clients[bench.ann].is_connected
+    bench.run(2)
+    assert bench.edge.room.clients.get(bench.ann) is not None
 
 
 # ------------------------------------------------------------ bad input
