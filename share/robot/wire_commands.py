@@ -78,8 +78,8 @@ class WireCommands:
         known.state = CommandState(
             state.command, None, state.commander, text, report.is_final, report.is_reached
         )
-        is_first = state.text == "taken"
-        known.is_told = report.is_final or is_first or self._progress_timer.fire_if_due(now_ns)
+        is_step = report.is_final or state.text == "taken" or report.text in set(ev.GoalStatus)
+        known.is_told = is_step or self._progress_timer.fire_if_due(now_ns)
         return known.state if known.is_told else None
 
     def tick(self, now_ns: int) -> tuple[list[ev.RobotEvent], list[CommandState]]:
