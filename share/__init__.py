@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from share.library.agent import AgentThread as Agent
     from share.library.edge import EdgeThread as Edge
     from share.library.recording import load_calibration, open_recording
+    from share.library.room import RoomThread as Room
     from share.library.tracker import Tracker
     from share.runtime.pose import Pose
     from share.types import Frame
@@ -62,6 +63,7 @@ _NAMES = {  # where each name is; imported when it is used, so that `import shar
     "Frame": ("share.types", "Frame"),
     "Pose": ("share.runtime.pose", "Pose"),
     "Rig": ("share.geometry.camera", "Rig"),
+    "Room": ("share.library.room", "RoomThread"),
     "ShareError": ("share.errors", "ShareError"),
     "Tracker": ("share.library.tracker", "Tracker"),
     "load_calibration": ("share.library.recording", "load_calibration"),
@@ -75,6 +77,7 @@ __all__ = [  # the interface that stays; all else may change between releases
     "Frame",
     "Pose",
     "Rig",
+    "Room",
     "ShareError",
     "Tracker",
     "load_calibration",

@@ -13,6 +13,13 @@ EventKind = Literal[
     "connection refused",
     "forgotten",
     "expired",
+    # clients, objects, robots
+    "client joined",
+    "client left",
+    "objects moved",
+    "object removed",
+    "robot commanded",
+    "robot answered",
     # what they send
     "bad message",
     "odometry suspect",

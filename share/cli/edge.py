@@ -42,6 +42,13 @@ if TYPE_CHECKING:
     type=options.PATH,
     help="Ask for the token in this file, made if it is not there; needed to serve other machines.",
 )
+@click.option(
+    "--allow",
+    "allow",
+    type=click.Choice(["commands", "objects"]),
+    multiple=True,
+    help="Without keys: let everyone on this machine send robots, or place objects. May be repeated.",
+)
 @click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
 @options.config
 @options.verbose
@@ -54,6 +61,7 @@ def edge(
     http: str | None,
     view: str | None,
     http_token: Path | None,
+    allow: tuple[str, ...],
     out: Path | None,
     config_file: Path | None,
     verbose: bool,
@@ -75,7 +83,7 @@ def edge(
 
     from share.cli.stderr import Stderr
     from share.net.http_guard import read_token
-    from share.net.keys import edge_keys_for
+    from share.net.keys import allowed_without_keys, edge_keys_for
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
@@ -86,6 +94,7 @@ def edge(
     from share.wire.layouts import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     edge_key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
+    allowed = allowed_without_keys(allow, edge_key_pair is not None)
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
@@ -116,6 +125,7 @@ def edge(
                     lambda e: _print_event(stderr, e, verbose),
                     store,
                     [*plans, *(room.feed for room in rooms)],
+                    allowed,
                 )
             )
         )
@@ -123,6 +133,8 @@ def edge(
         with stop_on_signal(run.stop):
             stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}")
             _print_keys(stderr, edge_key_pair)
+            if allowed:
+                stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")
             if status is not None:
                 stderr.print_line(f"status at http://{status.endpoint}/{password}")
             for room in rooms:
@@ -175,6 +187,12 @@ _SHOWN_EVENTS: set[EventKind] = {  # without -v
     "reconnected",
     "silent",
     "expired",
+    "client joined",
+    "client left",
+    "objects moved",
+    "object removed",
+    "robot commanded",
+    "robot answered",
     "refused",
     "room full",
     "connection refused",

@@ -60,20 +60,32 @@ def generate(name: str | None, keys: Path | None, as_json: bool) -> None:
     metavar="AGENT",
     help="Name of an agent on that machine, if not NAME; may be repeated.",
 )
+@click.option("--commands/--no-commands", default=None, help="Whether it may send robots.")
+@click.option("--objects/--no-objects", default=None, help="Whether it may place objects in the room.")
 @options.keys
-def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: Path | None) -> None:
+def authorize(
+    name: str,
+    public_key: str,
+    agents: tuple[str, ...],
+    commands: bool | None,
+    objects: bool | None,
+    keys: Path | None,
+) -> None:
     """Allow an agent to connect, by the public key of its machine: the text in single quotes, or NAME.public.
 
     NAME is the machine's name. Its key is valid for the agent of that name, or for those given with --agent,
-    and for no other. A running edge accepts the agent's next attempt, within about a second.
+    and for no other. A running edge accepts the agent's next attempt, within about a second. Repeated for the
+    same key, it changes what is given. At first a key may neither send robots nor place objects.
 
     \b
     Example:  share keys authorize ann ann.public
-              share keys authorize headset1 headset1.public --agent ann
+              share keys authorize headset1 headset1.public --agent ann --commands --objects
     """
     from share.net import keys as store
+    from share.wire.room_messages import Permission
 
-    store.authorize(_key_folder(keys), name, store.public_key(public_key), agents)
+    permissions = {Permission.COMMANDS: commands, Permission.OBJECTS: objects}
+    store.authorize(_key_folder(keys), name, store.public_key(public_key), agents, permissions)
 
 
 @keys.command(short_help="Withdraw a machine's authorization.")
@@ -103,16 +115,22 @@ def list_keys(keys: Path | None, as_json: bool) -> None:
 
     folder = _key_folder(keys)
     edge_key_set = edge_keys(folder)
-    grants = sorted((grant.name, key, grant.agents) for key, grant in edge_key_set.allowed.grants().items())
+    grants = sorted(
+        (grant.name, key, grant.agents, sorted(grant.permissions))
+        for key, grant in edge_key_set.allowed.grants().items()
+    )
     own: dict[str, Any] = {"name": edge_key_set.own.name, "public_key": edge_key_set.own.public}
     if as_json:
-        listed = [{"name": name, "public_key": key, "agents": agents} for name, key, agents in grants]
+        listed = [
+            {"name": name, "public_key": key, "agents": agents, "may": may}
+            for name, key, agents, may in grants
+        ]
         click.echo(json.dumps({"folder": str(folder), "own": own, "authorized": listed}))
         return
     click.echo(f"{edge_key_set.own.public}  {edge_key_set.own.name} (this machine)")
-    for name, key, agents in grants:
+    for name, key, agents, may in grants:
         others = "" if agents == (name,) else f", for {', '.join(agents)}"
-        click.echo(f"{key}  {name}{others}")
+        click.echo(f"{key}  {name}{others}{'; may: ' + ', '.join(may) if may else ''}")
 
 
 def _key_folder(folder_given: Path | None) -> Path:

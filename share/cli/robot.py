@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import options
+from share.cli import options, room_options
 from share.cli.commands import CommandGroup
 from share.cli.terminal import LiveLine
 from share.errors import ShareError, UsageError
@@ -28,6 +28,15 @@ _domain = click.option(
 )
 _namespace = click.option(
     "--namespace", default="", metavar="NAME", help="The robot's namespace, such as tb1.  [default: none]"
+)
+
+
+_over_wire = options.option_group(
+    room_options.edge("Reach the robot over this edge.  [default: the bridge on this machine]"),
+    room_options.name,
+    click.option("--robot", "robot_name", metavar="NAME", help="Robot at the edge.  [default: the only one]"),
+    options.keys,
+    room_options.server_key,
 )
 
 
@@ -73,6 +82,10 @@ def robot() -> None:
     multiple=True,
     help="The robot's address, for a network without multicast. May be repeated.",
 )
+@room_options.edge("Take goals from this edge too, as the robot of --name.")
+@click.option("--name", help="Name of the robot at the edge: that of its agent.")
+@options.keys
+@room_options.server_key
 def bridge(
     robot_file: Path,
     poses: str,
@@ -81,16 +94,21 @@ def bridge(
     domain: int,
     namespace: str,
     peers: tuple[str, ...],
+    address: str | None,
+    name: str | None,
+    keys: Path | None,
+    server_key: str | None,
 ) -> None:
     """Publish map → odom and /map for the robot's Nav2, and pass goals on to it, until Ctrl-C.
 
     The robot moves only with --allow-goals, within the area and the speed of --robot, and while its place
     in the map is known: a pose that is lost, older than 0.5 s or unsure cancels the goal and ends map → odom.
+    With --edge it also takes goals of all whom the edge lets command robots.
 
     \b
     Example:  share robot bridge --robot robot.yaml --allow-goals
     """
-    from contextlib import closing
+    from contextlib import ExitStack, closing
 
     from share.net.udp import StampedSocket
     from share.robot.robot_file import read_robot
@@ -106,12 +124,17 @@ def bridge(
     def print_line(text: str) -> None:
         live.print_line(f"share robot: {text}")
 
-    with (
-        closing(StampedSocket.bind(_poses_address(poses))) as link,
-        closing(CommandServer(command_path(domain, namespace))) as commands,
-        closing(RosNode(domain, namespace, peers)) as node,
-    ):
-        run = RobotBridgeRun(replace(description, settings=settings), node, link, commands, print_line)
+    with ExitStack() as stack:
+        room = None
+        if address is not None:
+            wants = {"drives_robot": True, "print_line": print_line}
+            room = stack.enter_context(
+                closing(room_options.open_room(address, name or agent, keys, server_key, **wants))
+            )
+        link = stack.enter_context(closing(StampedSocket.bind(_poses_address(poses))))
+        commands = stack.enter_context(closing(CommandServer(command_path(domain, namespace))))
+        node = stack.enter_context(closing(RosNode(domain, namespace, peers)))
+        run = RobotBridgeRun(replace(description, settings=settings), node, link, commands, print_line, room)
         with stop_on_signal(run.stop):
             moving = "goals are allowed" if allow_goals else "no goals (--allow-goals)"
             print_line(f"domain {domain}, poses at {poses}, {moving}, at most {settings.max_speed_m_s:g} m/s")
@@ -143,26 +166,47 @@ def _poses_address(text: str) -> HostPort:
 )
 @_domain
 @_namespace
+@_over_wire
 @options.as_json
 def goto(
-    x: float, y: float, yaw: float | None, map_id: str | None, domain: int, namespace: str, as_json: bool
+    x: float,
+    y: float,
+    yaw: float | None,
+    map_id: str | None,
+    domain: int,
+    namespace: str,
+    address: str | None,
+    name: str | None,
+    robot_name: str | None,
+    keys: Path | None,
+    server_key: str | None,
+    as_json: bool,
 ) -> None:
     """Send the robot to X Y, m in the map, and wait until it is there. Exit code 1 if it does not get there.
 
     YAW is where it then looks, degrees counterclockwise from the map's x; without it, the way it came.
-    Ctrl-C stops the robot, as does the end of this command however it comes.
+    Ctrl-C stops the robot, as does the end of this command however it comes. It reaches a bridge on this
+    machine, or with --edge any robot at that edge (then within 3 s, if this command is killed).
 
     \b
     Example:  share robot goto 2.5 -0.8 90
+              share robot goto 2.5 -0.8 --edge tcp://127.0.0.1:5555 --name ann
     """
     from share.runtime.robot_commands import ask_bridge, command_path
 
-    wish = {"do": "goto", "x": x, "y": y, "yaw": None if yaw is None else radians(yaw), "map_id": map_id}
+    turned = None if yaw is None else radians(yaw)
+    wish = {"do": "goto", "x": x, "y": y, "yaw": turned, "map_id": map_id}
     live, last = LiveLine(), {"goal": "the bridge has ended", "is_reached": False}
-    for answer in ask_bridge(command_path(domain, namespace), wish):
+    answers = ask_bridge(command_path(domain, namespace), wish)
+    if address is not None:
+        from share.cli.robot_wire import goto_answers
+
+        room = room_options.open_room(address, name, keys, server_key)
+        answers = goto_answers(room, robot_name, x, y, turned, map_id)
+    for answer in answers:
         last = answer
         live.write(str(answer.get("goal")))
-        if answer.get("is_final"):
+        if answer.get("is_final") and address is None:  # over an edge the answers end, and close the link
             break
     live.end()
     text, is_reached = str(last["goal"]), bool(last.get("is_reached"))
@@ -177,7 +221,16 @@ def goto(
 @robot.command(short_help="Stop the robot.")
 @_domain
 @_namespace
-def cancel(domain: int, namespace: str) -> None:
+@_over_wire
+def cancel(
+    domain: int,
+    namespace: str,
+    address: str | None,
+    name: str | None,
+    robot_name: str | None,
+    keys: Path | None,
+    server_key: str | None,
+) -> None:
     """Cancel the robot's goal, whoever gave it.
 
     \b
@@ -185,6 +238,11 @@ def cancel(domain: int, namespace: str) -> None:
     """
     from share.runtime.robot_commands import ask_bridge, command_path
 
+    if address is not None:
+        from share.cli.robot_wire import cancel_over_wire
+
+        click.echo(cancel_over_wire(room_options.open_room(address, name, keys, server_key), robot_name))
+        return
     for answer in ask_bridge(command_path(domain, namespace), {"do": "cancel"}):
         click.echo(answer.get("goal"))
 
@@ -192,8 +250,18 @@ def cancel(domain: int, namespace: str) -> None:
 @robot.command(short_help="Show where the robot is and what it does.")
 @_domain
 @_namespace
+@_over_wire
 @options.as_json
-def watch(domain: int, namespace: str, as_json: bool) -> None:
+def watch(
+    domain: int,
+    namespace: str,
+    address: str | None,
+    name: str | None,
+    robot_name: str | None,
+    keys: Path | None,
+    server_key: str | None,
+    as_json: bool,
+) -> None:
     """Show where the robot is and what it does, twice a second, until Ctrl-C. With --json, a line of JSON
     each time.
 
@@ -202,6 +270,12 @@ def watch(domain: int, namespace: str, as_json: bool) -> None:
     """
     from share.runtime.robot_commands import ask_bridge, command_path
 
+    if address is not None:
+        from share.cli.robot_wire import watch_over_wire
+
+        wants = {"wants_robots": True}
+        watch_over_wire(room_options.open_room(address, name, keys, server_key, **wants), robot_name, as_json)
+        return
     live = LiveLine()
     for answer in ask_bridge(command_path(domain, namespace), {"do": "watch"}):
         if as_json:

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import multiprocessing
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from share.config import POLICY_NAMES, STREAMED, Config, with_policy
 from share.errors import UsageError
 from share.library.background import BackgroundRun
 from share.library.checked_input import checked_call, checked_config, checked_kind, checked_path
-from share.net.keys import edge_keys_for
+from share.net.keys import allowed_without_keys, edge_keys_for
 from share.net.transport import bind, parse_address
 from share.runtime.edge import EdgeRun
 from share.store.map_store import MapStore
@@ -40,9 +40,11 @@ class EdgeThread(BackgroundRun):
         config: Config | None = None,
         keys: str | Path | None = None,
         out: str | Path | None = None,
+        allow: Collection[str] = (),
         on_event: Callable[[dict[str, Any]], None] = lambda event: None,
     ) -> None:
-        """address: to listen at; port 0 takes a free one. policy, map_file, keys, out: as of `share edge`.
+        """address: to listen at; port 0 takes a free one. policy, map_file, keys, out, allow: as of `share
+        edge`.
         on_event: called from the edge's thread with each decision (events.jsonl); must not wait. Raises
         ShareError."""
         if getattr(multiprocessing.current_process(), "_inheriting", False):
@@ -63,6 +65,7 @@ class EdgeThread(BackgroundRun):
         )
         own_out = None if out is None else checked_path("out", out)
         checked_call("on_event", on_event)
+        allowed = allowed_without_keys(allow, own_keys is not None)
         self._error: BaseException | None = None
         self._report: dict[str, Any] = {}
         with contextlib.ExitStack() as stack:
@@ -73,7 +76,7 @@ class EdgeThread(BackgroundRun):
             if map_file is not None:
                 store = MapStore.open(checked_path("map_file", map_file))
                 stack.callback(store.close)
-            self._run = EdgeRun(settings, link, own_out, on_event, store)
+            self._run = EdgeRun(settings, link, own_out, on_event, store, allowed=allowed)
             stack.callback(self._run.close)
             self._resources = stack.pop_all()
         self._thread = threading.Thread(target=self._run_to_end, name="edge", daemon=True)

@@ -19,6 +19,16 @@ _MIN_ROTATION_RAD = float(np.radians(0.02))
 
 
 @dataclass(frozen=True, eq=False)
+class MapsJoined:
+    """The map `absorbed` is part of `survivor` from now on. T_survivor_absorbed (4, 4): as the mapper moved
+    it; agents are shown it with their next correction."""
+
+    survivor: str
+    absorbed: str
+    T_survivor_absorbed: F64
+
+
+@dataclass(frozen=True, eq=False)
 class MapEvent:
     """A decision with its reason, and the correction that follows, if any.
 
@@ -30,6 +40,7 @@ class MapEvent:
     reason: str
     correction: Correction | None = None
     map_id: str | None = None
+    joined: MapsJoined | None = None
 
 
 def map_assignment(

@@ -13,7 +13,7 @@ from typing import Any
 from share.config import Config
 from share.mapping.atlas import Atlas
 from share.mapping.candidates import choose_checks, larger_maps_first, nearby_candidates
-from share.mapping.corrections import MapEvent
+from share.mapping.corrections import MapEvent, MapsJoined
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import SaveView
 from share.mapping.mapper_log import MapperLog
@@ -187,8 +187,10 @@ class KeyframeLookup:
         counters.merges["done"] += 1
         self._merge_gate.record_merge(self._overlap_volume(a, b, loop.T_a_b))
         undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
-        accepted = MapEvent(b.agent, "maps merged" if decision.joined_maps else "loop accepted", reason)
-        return [*events, *undone, accepted]
+        if decision.joined_maps is None or decision.T_join is None:
+            return [*events, *undone, MapEvent(b.agent, "loop accepted", reason)]
+        joined = MapsJoined(*decision.joined_maps, decision.T_join)
+        return [*events, *undone, MapEvent(b.agent, "maps merged", reason, joined=joined)]
 
     def _review_joins(self, node_id: int) -> list[MapEvent]:
         """Undo a recent merge that the view of a new keyframe contradicts; else see what is gone since an

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,8 +56,8 @@ _MAX_CHECKED = 8  # accepted loops whose found share is computed when others con
 class LoopDecision:
     """Decision on a loop, with its reason.
 
-    joined_maps: merged maps, the surviving name first. added: all loops accepted by it, this one and pending
-    ones; dropped: loops removed.
+    joined_maps: merged maps, the surviving name first; T_join (4, 4): from the other's frame to its. added:
+    all loops accepted by it, this one and pending ones; dropped: loops removed.
     """
 
     accepted: bool
@@ -65,6 +65,7 @@ class LoopDecision:
     joined_maps: tuple[str, str] | None = None
     added: tuple[Loop, ...] = ()
     dropped: tuple[Loop, ...] = ()
+    T_join: F64 | None = field(default=None, compare=False)
 
 
 class LoopAcceptance:
@@ -228,8 +229,7 @@ class LoopAcceptance:
         dropped = self._graph.drop_loops(edge_ids)
         self.contradicting, others = [], [loop for loop in self.contradicting if loop not in loops]
         self.pending += others
-        accepted = self._accept(loops, f"{reason}; {dropped_text(dropped)}")
-        return LoopDecision(True, accepted.reason, accepted.joined_maps, accepted.added, dropped)
+        return replace(self._accept(loops, f"{reason}; {dropped_text(dropped)}"), dropped=dropped)
 
     # Loops between two maps
 
@@ -362,8 +362,9 @@ class LoopAcceptance:
         references = sorted(
             {graph.reference_segment(key) for key in (loops[-1].a, loops[-1].b)}, key=graph.rank
         )
+        surest, T_join = min(loops, key=lambda loop: float(loop.cov.trace())), None
         if len(references) > 1:
-            graph.align_maps(min(loops, key=lambda loop: float(loop.cov.trace())))
+            T_join = graph.align_maps(surest)
         self._add_loops(loops)
         if len(references) == 1:
             return LoopDecision(True, reason, added=tuple(loops))
@@ -371,7 +372,7 @@ class LoopAcceptance:
         added = self.accept_fitting()
         survivor, absorbed = (graph.odometry.segments[s].name for s in references)
         reason += f"{pending_text(added)}: map {absorbed} merged into {survivor}"
-        return LoopDecision(True, reason, (survivor, absorbed), (*loops, *added))
+        return LoopDecision(True, reason, (survivor, absorbed), (*loops, *added), T_join=T_join)
 
     def _add_loops(self, loops: Sequence[Loop]) -> None:
         accepted = {loop.keyframes for loop in loops}

@@ -19,6 +19,7 @@ from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64, Keyframe
 from share.vision.packed_view import PackedView
 from share.wire.messages import Hello
+from share.wire.room_messages import RoomObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +163,21 @@ def _poses_of_columns(agents: list[str], ids: list[int], T: F64, map_ids: tuple[
     return SavePoses(tuple(map(KeyframeKey, agents, ids)), T, map_ids)
 
 
+@dataclass(frozen=True, eq=False)
+class SaveObject:
+    """An object of the room as it is now. home_map: in which map it was placed."""
+
+    object: RoomObject
+    home_map: str
+
+
+@dataclass(frozen=True)
+class RemoveStoredObject:
+    """Removes an object of the room."""
+
+    object_id: int
+
+
 MapChange = (
     SaveRun
     | SaveCredential
@@ -174,6 +190,8 @@ MapChange = (
     | RemoveRun
     | Wipe
     | SavePoses
+    | SaveObject
+    | RemoveStoredObject
 )
 
 
@@ -183,7 +201,7 @@ class StoredMap:
 
     runs, segments (names), keyframes: in order of arrival; segments may be empty. links: for keyframes whose
     odometry edge was replaced. loops: oldest first. next_ids: for each run, an id above all it ever had here.
-    problems: what is missing, a line each.
+    problems: what is missing, a line each. objects: of the room.
     """
 
     runs: tuple[SaveRun, ...] = ()
@@ -194,6 +212,7 @@ class StoredMap:
     poses: SavePoses | None = None
     next_ids: Mapping[str, int] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
+    objects: tuple[SaveObject, ...] = ()
 
 
 def with_unknown_credentials(kept: StoredMap) -> StoredMap:

@@ -251,12 +251,14 @@ class MapGraph:
             self.unsolved_maps[reference_segment] = None
         return dropped
 
-    def align_maps(self, loop: Loop) -> None:
-        """Move the map of lower precedence rigidly to where the loop puts it."""
+    def align_maps(self, loop: Loop) -> F64:
+        """Move the map of lower precedence rigidly to where the loop puts it. Return the motion (4, 4)."""
         if self.rank(self.reference_segment(loop.a)) > self.rank(self.reference_segment(loop.b)):
             loop = loop.reverse()
         a, b = self.loop_nodes(loop)
-        self.move_map(self.reference_segment(loop.b), self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b]))
+        T: F64 = self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b])
+        self.move_map(self.reference_segment(loop.b), T)
+        return se3.orthonormal(T)
 
     def move_map(self, reference_segment: int, T: F64) -> None:
         """Transform a whole map rigidly by T (4, 4) from the left."""

@@ -2,8 +2,9 @@
 
 A folder holds one machine's key pair, `NAME.public` and `NAME.secret`, and at an edge the list `authorized`.
 Each file consists of lines `share-public-key NAME KEY` (`share-secret-key` for the secret). In the list the
-names of the agents that may run on that machine can follow; without any, only the agent NAME may. KEY is a
-32-byte Curve25519 key in Z85 (RFC 26 CurveZMQ, RFC 32 Z85): 40 characters, none of them a quote.
+names of the agents that may run on that machine can follow; without any, only the agent NAME may; then what
+it may do as a client, +commands and +objects. KEY is a 32-byte Curve25519 key in Z85 (RFC 26 CurveZMQ, RFC 32
+Z85): 40 characters, none of them a quote.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import re
 import socket
 import stat
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -22,11 +23,13 @@ from share.errors import UsageError
 from share.files.locks import folder_locked
 from share.files.reading import MAX_KEYS_BYTES, read_text
 from share.files.writing import atomic_write, write_errors, xdg_folder
+from share.wire.room_messages import Permission
 
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
 _Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
 _LIST_FILE = "authorized"
-_LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})((?: {_NAME})*)")
+_MAY = "|".join(Permission)
+_LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})((?: {_NAME})*)((?: \+(?:{_MAY}))*)")
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,14 @@ class AllowList:
             return frozenset()
         return frozenset() if grant is None else frozenset(grant.agents)
 
+    def permissions_of(self, public: str) -> frozenset[Permission]:
+        """Return what this key may do as a client; nothing while the file is unreadable."""
+        try:
+            grant = self.grants().get(public)
+        except UsageError:
+            return frozenset()
+        return frozenset() if grant is None else grant.permissions
+
     def grants(self) -> dict[str, Grant]:
         """Return all grants by public key. Raises UsageError if the file is unreadable or malformed."""
         try:
@@ -102,10 +113,12 @@ class AllowList:
 
 
 class Grant(NamedTuple):
-    """An entry of the list: the machine's name, and the agents that its key may act for."""
+    """An entry of the list: the machine's name, the agents that its key may act for, and what it may do as a
+    client."""
 
     name: str
     agents: tuple[str, ...]
+    permissions: frozenset[Permission] = frozenset()
 
 
 class _ListLine(NamedTuple):
@@ -162,7 +175,7 @@ def load_pair(folder: Path) -> KeyPair:
     if path.stat().st_mode & 0o077:
         raise UsageError(f"{path}: others can read this secret; `chmod 600 {path}`, or make a new pair")
     match = _LINE.fullmatch(_read_text(path).strip())
-    if not match or match[1] != "secret" or not _is_key(match[3]) or match[4]:
+    if not match or match[1] != "secret" or not _is_key(match[3]) or match[4] or match[5]:
         raise UsageError(
             f"{path}: is not a SHARE secret key; move it away and make a new pair with `share keys generate`"
         )
@@ -187,14 +200,25 @@ def allow_list(folder: Path) -> AllowList:
     return AllowList(folder / _LIST_FILE)
 
 
-def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) -> None:
-    """Authorize the machine `name` to act for `agents` (default: the agent `name`), in place of those before.
-    Raises UsageError if the name or the key is taken, or the list is damaged."""
+def authorize(
+    folder: Path,
+    name: str,
+    public: str,
+    agents: Sequence[str] = (),
+    permissions: Mapping[Permission, bool | None] | None = None,
+) -> None:
+    """Authorize the machine `name` to act for `agents` (default: those before, or the agent `name`).
+
+    permissions: to give (True) or to take back (False); others stay as they are. Raises UsageError if the
+    name or the key is taken, or the list is damaged.
+    """
     name, agents = _checked_name(name), [_checked_name(agent) for agent in agents]
-    line = _format_line(name, public, agents)
     _make_folder(folder)
     with folder_locked(folder):  # one of two writers could undo the other's revocation
-        names = dict(allow_list(folder).names_by_key())
+        grants = allow_list(folder).grants()
+        names = {key: grant.name for key, grant in grants.items()}
+        old = grants.get(public, Grant(name, ()))
+        line = _format_line(name, public, agents or old.agents, _changed(old.permissions, permissions or {}))
         if names.get(public, name) != name:
             raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
         if name in names.values() and public not in names:
@@ -202,8 +226,8 @@ def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) 
         lines = _read_lines(folder / _LIST_FILE)
         if public not in names:
             _write_list(folder, [*lines, _ListLine(line)])
-        elif agents:
-            _write_list(folder, [old._replace(text=line) if old.key == public else old for old in lines])
+        else:
+            _write_list(folder, [one._replace(text=line) if one.key == public else one for one in lines])
 
 
 def revoke(folder: Path, name: str) -> None:
@@ -245,6 +269,17 @@ def edge_keys_for(folder: Path | None, is_local: bool) -> EdgeKeys | None:
     return edge_keys(folder)
 
 
+def allowed_without_keys(names: Collection[str], has_keys: bool) -> frozenset[Permission]:
+    """Return what every client may do, by name. Raises UsageError for an unknown name, or with keys."""
+    if names and has_keys:
+        raise UsageError(
+            "--allow: with keys the list says who may; share keys authorize … --commands --objects"
+        )
+    if unknown := [one for one in names if one not in set(Permission)]:
+        raise UsageError(f"--allow {unknown[0]!r:.40}: known are {', '.join(Permission)}")
+    return frozenset(map(Permission, names))
+
+
 def _parse_line(line: str, where: str) -> tuple[str, Grant]:
     """Return the key of a line and what it grants. Raises UsageError."""
     match = _LINE.fullmatch(line.strip())
@@ -252,11 +287,20 @@ def _parse_line(line: str, where: str) -> tuple[str, Grant]:
         raise UsageError(f"{where}: is a secret key, which must stay on its machine; give the public key")
     if not match or not _is_key(match[3]):
         raise UsageError(f"{where}: is not `share-public-key NAME KEY`")
-    return match[3], Grant(match[2], tuple(match[4].split()) or (match[2],))
+    permissions = frozenset(Permission(word.removeprefix("+")) for word in match[5].split())
+    return match[3], Grant(match[2], tuple(match[4].split()) or (match[2],), permissions)
 
 
-def _format_line(name: str, public: str, agents: Sequence[str] = ()) -> str:
-    return " ".join(("share-public-key", name, public, *agents)) + "\n"
+def _changed(old: frozenset[Permission], changes: Mapping[Permission, bool | None]) -> list[Permission]:
+    return [one for one in Permission if (one in old if changes.get(one) is None else changes[one])]
+
+
+def _format_line(
+    name: str, public: str, agents: Sequence[str] = (), permissions: Iterable[Permission] = ()
+) -> str:
+    own_only = tuple(agents) == (name,)
+    words = ("share-public-key", name, public, *(() if own_only else agents))
+    return " ".join((*words, *(f"+{one}" for one in permissions))) + "\n"
 
 
 def _is_key(text: str) -> bool:

@@ -18,6 +18,7 @@ from typing import Protocol
 from share.errors import TransportError, UsageError
 from share.net.keys import AgentKeys, EdgeKeys
 from share.wire.layouts import MAX_FRAME_BYTES, Bytes
+from share.wire.room_messages import Permission
 
 QUEUE_MESSAGES = 128  # per queue and direction; poses at 30 Hz fill it in 4 s
 LINGER_MS = 200  # how long `close` waits for the last messages to leave
@@ -79,6 +80,10 @@ class EdgeLink(Protocol):
 
     def agent_names(self, key: str) -> frozenset[str] | None:
         """Return the names of the agents that this key may act for; None if no keys are used."""
+        ...
+
+    def permissions(self, key: str) -> frozenset[Permission]:
+        """Return what the holder of this key may do as a client; nothing without keys."""
         ...
 
     def refusals(self) -> list[str]:

@@ -19,6 +19,7 @@ from share.net.transport import LINGER_MS, Address, IncomingMessage, bind_error,
 from share.net.zeromq_socket import MAX_PARTS, WAKE, ZmqSocket
 from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 from share.wire.messages import PEER_ID_BYTES
+from share.wire.room_messages import Permission
 
 _GUARD_WAKE = b"g"  # wakes the socket for the guard: look for a message, but do not return without one
 _MAX_REFUSALS = 128  # lines at a time
@@ -131,6 +132,9 @@ class ZmqEdgeLink:
         if key not in self._agent_names:
             self._agent_names[key] = self._keys.allowed.agents_for(key)
         return self._agent_names[key]
+
+    def permissions(self, key: str) -> frozenset[Permission]:
+        return frozenset() if self._keys is None else self._keys.allowed.permissions_of(key)
 
     def trouble(self) -> str | None:
         return self._list_trouble

@@ -14,7 +14,7 @@ from share import __version__
 from share.config import Config
 from share.errors import VersionError, WireError, describe_exception
 from share.mapping.corrections import MapEvent
-from share.mapping.map_changes import SaveKeyframe, SaveRun
+from share.mapping.map_changes import SaveKeyframe, SaveObject, SavePoses, SaveRun
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.edge_membership import RoomMembership
@@ -26,7 +26,9 @@ from share.timing import Throttle
 from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import decode, message_bytes
+from share.wire.room_messages import ClientHello
 
+_NO_SESSION = 0  # in a pong to a client that the edge has forgotten: it says hello again
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 
@@ -34,8 +36,8 @@ class Edge(RoomMembership):
     """Serves all agents of one room.
 
     session: names this start of the edge, so that agents notice a restart. has_store: acknowledge a keyframe
-    only after `ChangesSaved`. restored: runs of earlier sessions. began_ns: origin of the times in records
-    (default: the first event).
+    only after `ChangesSaved`. restored: runs of earlier sessions; objects: of the room. began_ns: origin of
+    the times in records (default: the first event).
     """
 
     def __init__(
@@ -45,8 +47,9 @@ class Edge(RoomMembership):
         has_store: bool = False,
         restored: Sequence[RestoredRun] = (),
         began_ns: int | None = None,
+        objects: Sequence[SaveObject] = (),
     ) -> None:
-        super().__init__(config, session, has_store, restored, began_ns)
+        super().__init__(config, session, has_store, restored, began_ns, objects)
         self.latest_poses = self._registry.latest_poses
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._version_throttle, self._internal_errors = Throttle(_VERSION_REFUSAL_HZ, 1.0), 0
@@ -73,10 +76,15 @@ class Edge(RoomMembership):
                 for finding in event.findings:
                     self._on_finding(finding)
                 self._registry.mark_empty(event.empty_runs)
+                for change in event.changes:
+                    if isinstance(change, SavePoses):
+                        self.room.add_solved(set(change.map_ids))
             case ed.ChangesSaved():
                 self._acknowledge(*self._out.durability.mark_saved(event.ticket))
+                self.room.mark_saved(event.ticket)
             case ed.EdgeTick():
                 self._check_silence()
+                self.room.tick()
 
     def _on_internal_error(self, event: ed.EdgeEvent, error: Exception) -> None:
         self._internal_errors += 1
@@ -89,24 +97,33 @@ class Edge(RoomMembership):
     # ------------------------------------------------------------------ messages
 
     def _on_message(self, event: ed.PeerMessageReceived) -> None:
-        peer = self._registry.get(event.peer_id)
-        self._registry.sender(event.peer_id).counts["bytes_up"] += message_bytes(event.frames)
+        peer, client = self._registry.get(event.peer_id), self.room.clients.get(event.peer_id)
+        sender = client or self._registry.sender(event.peer_id)
+        sender.counts["bytes_up"] += message_bytes(event.frames)
         try:
             message = decode(event.frames)
         except VersionError as error:
             self._on_other_version(event.peer_id, error)
             return
         except WireError as error:
-            self._count_bad_message(peer, str(error))
+            self._count_bad_message(client or peer, str(error))
             return
         if peer is not None and not self._may_send(event, peer, message):
             return
+        if client is not None and not self.room.may_send(event, client):
+            self._count_bad_message(None, f"a key that is not authorized for '{client.name}' used its run")
+            return
         match message:
-            case wire.Hello():
+            case ClientHello():
+                self.room.on_hello(event, message)
+            case wire.Hello() if client is None:
                 self._on_hello(event, message)
             case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 times = message.sent_ns, self._out.now_ns, self._out.now_ns
-                self._out.send(event.peer_id, wire.Pong(message.sequence, *times, self._session))
+                session = _NO_SESSION if self.room.clients.was_removed(event.peer_id) else self._session
+                self._out.send(event.peer_id, wire.Pong(message.sequence, *times, session))
+            case _ if client is not None:
+                self.room.on_message(event, client, message)
             case wire.Bye() if peer:
                 peer.status.leave()
                 self._mark_gone(peer, "left", "sent bye")
@@ -185,6 +202,8 @@ class Edge(RoomMembership):
         # a run is stored with its first keyframe
         run = (SaveRun(peer.key, peer.hello, peer.credential),) if peer.odometry_base is None else ()
         peer.odometry_base = OdometryBase.from_keyframe(keyframe, peer.odometry_base)
+        if keyframe.reference < 0:
+            self.room.begin_segment(peer.key, keyframe.id)
         self._out.save(*run, SaveKeyframe(peer.key, keyframe))
         is_over_rate = self._quota.is_over_rate(peer.name, self._out.now_ns)
         self._out.add(ed.AddKeyframe(peer.key, keyframe, is_over_rate))
@@ -201,6 +220,7 @@ class Edge(RoomMembership):
 
     def _on_finding(self, finding: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
+        self.room.on_finding(finding)
         if finding.agent is None:
             self._out.record(finding.event, None, finding.reason, map_id=finding.map_id)
         elif (peer := self._registry.by_key.get(finding.agent)) is None:
@@ -241,7 +261,9 @@ class Edge(RoomMembership):
             "refused": [
                 *filter(None, [self._rate_scheduler.full_reason(self._out.now_ns)]),
                 *fault_warnings(peers, self._registry.unjoined, self._out.now_ns),
+                *self.room.warnings(),
             ],
+            **self.room.report(),
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,
             "version": __version__,

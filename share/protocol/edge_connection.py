@@ -12,6 +12,7 @@ from share.timing import PeriodicTimer, seconds_to_ns
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 from share.wire.layouts import Bytes
+from share.wire.room_messages import ClientHello
 
 HELLO_S = 0.5  # interval of hellos, until welcomed
 REFUSED_S = 5.0  # a running agent that was refused asks again after this
@@ -76,7 +77,7 @@ class EdgeConnection:
     offline_text: what becomes of the agent without an edge.
     """
 
-    def __init__(self, hello: m.Hello, silent_s: float, offline_text: str) -> None:
+    def __init__(self, hello: m.Hello | ClientHello, silent_s: float, offline_text: str) -> None:
         self.is_connected = False  # an edge has welcomed it and is not silent
         self.refusal: str | None = None  # last reason that the edge gave
         self.sessions = EdgeSessions()

@@ -14,6 +14,7 @@ from share.mapping.map_changes import MapChange
 from share.types import Frame, Keyframe
 from share.wire import messages as wire
 from share.wire.layouts import Bytes
+from share.wire.room_messages import Permission
 
 # ---------------------------------------------------------------- events
 
@@ -23,12 +24,13 @@ class PeerMessageReceived:
     """An undecoded message of a peer, by its transport id.
 
     allowed_names: agents that its credential is authorised for; None without keys. credential: its public
-    key; "" without keys."""
+    key; "" without keys. permissions: what it may do as a client."""
 
     peer_id: bytes
     frames: Sequence[Bytes]
     allowed_names: frozenset[str] | None = None
     credential: str = ""
+    permissions: frozenset[Permission] = frozenset()
 
     def is_authorised_for(self, name: str) -> bool:
         return self.allowed_names is None or name in self.allowed_names

@@ -9,11 +9,13 @@ from typing import ClassVar
 from share.config import Config
 from share.event_kinds import EventKind
 from share.mapping.corrections import MapEvent
-from share.mapping.map_changes import RemoveRun, SaveCredential
+from share.mapping.map_changes import RemoveRun, SaveCredential, SaveObject
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.peer import Peer, RestoredRun
+from share.protocol.room_clients import Client
+from share.protocol.room_desk import RoomDesk
 from share.scheduling.rate_scheduler import RateScheduler
 from share.scheduling.room_budget import RateGrant
 from share.timing import seconds_to_ns
@@ -33,14 +35,17 @@ class RoomMembership:
         has_store: bool,
         restored: Sequence[RestoredRun],
         began_ns: int | None,
+        objects: Sequence[SaveObject],
     ) -> None:
         """See `share.protocol.edge.Edge`."""
         self._config, self._session, self._registry = config, session, RunRegistry()
         self._out = EdgeOutput(self._registry, has_store, began_ns)
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self._admission = Admission(config.edge, self.tracks_agents, self._rate_scheduler.objection)
+        self.room = RoomDesk(self._out, self._registry, session, config.edge.silent_s, objects)
         for run in restored:
             self._registry.restore(run)
+        self.room.restore(run.last_finding for run in restored if run.last_finding is not None)
 
     def _on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> None:
         """Welcome a new or known run, or refuse it. No answer while the name's present run may be dead: the
@@ -145,6 +150,7 @@ class RoomMembership:
         if self._registry.forget(peer):  # it was the latest of its name
             self._rate_scheduler.forget(peer.name)
         self._out.add(ed.DropRun(peer.key))
+        self.room.forget_run(peer.key)
 
     def _may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
         """Return whether a known run may send: its credential allows it, and it is present or comes back."""
@@ -182,7 +188,7 @@ class RoomMembership:
             self._out.send(peer.id, wire.Rate(grant.hz, self._rate_scheduler.is_windowed, grant.pose_hz))
             peer.grant = grant
 
-    def _count_bad_message(self, peer: Peer | None, reason: str) -> None:
+    def _count_bad_message(self, peer: Peer | Client | None, reason: str) -> None:
         """Count a bad message; record the first of each peer."""
         if (peer or self._registry.unjoined).count("bad_messages", reason, self._out.now_ns) == 1:
-            self._out.record("bad message", peer, reason, throttled=False)
+            self._out.record("bad message", peer, reason, throttled=isinstance(peer, Client))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from share.event_kinds import EventKind
 from share.mapping.map_changes import MapChange
@@ -96,6 +96,13 @@ class DurabilityTracker:
         return self.mark_saved(self._saved_ticket if self._has_store else self._ticket)
 
 
+class Named(Protocol):
+    """Whoever caused an event: an agent's run, or a client."""
+
+    @property
+    def name(self) -> str: ...
+
+
 class EdgeOutput:
     """Collects the effects of one event: messages, records, changes to be stored. now_ns: its time."""
 
@@ -124,16 +131,19 @@ class EdgeOutput:
         self.add(SendToPeer(peer_id, frames))
 
     def record(
-        self, event: EventKind, peer: Peer | None, reason: str, throttled: bool = True, **fields: Any
+        self, event: EventKind, peer: Named | None, reason: str, throttled: bool = True, **fields: Any
     ) -> None:
         """Record an event. throttled: unless it is repeated too often, as a peer could cause it."""
         make = self._event_log.throttled_event if throttled else self._event_log.event
         if (effect := make(self.now_ns, event, peer.name if peer else None, reason, **fields)) is not None:
             self.add(effect)
 
-    def save(self, *changes: MapChange) -> None:
-        if (effect := self.durability.save(changes)) is not None:
-            self.add(effect)
+    def save(self, *changes: MapChange) -> int | None:
+        """Store changes; return their ticket, None without a store."""
+        if (effect := self.durability.save(changes)) is None:
+            return None
+        self.add(effect)
+        return effect.ticket
 
 
 _MERGE_COUNTS = (("merges", "requested"), ("merges", "skipped"), ("merges", "done"))

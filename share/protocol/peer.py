@@ -212,6 +212,11 @@ def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list
     for peer in peers:
         kinds.append((f"agent '{peer.name}'", "messages refused", peer.refusals))
         kinds.append((f"agent '{peer.name}'", "suspect keyframes", peer.suspect_keyframes))
+    return fault_lines(kinds, now_ns)
+
+
+def fault_lines(kinds: Iterable[tuple[str, str, Faults]], now_ns: int) -> list[str]:
+    """Return a warning line for each sender, kind and faults that are many and recent."""
     return [
         f"{sender}: {faults.count} {kind}, the last: {faults.reason}"
         for sender, kind, faults in kinds

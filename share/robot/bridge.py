@@ -184,7 +184,8 @@ class RobotBridge:
         refusal = self._refusal() or self._goal_refusal(event)
         if refusal is not None:
             self._print(f"goal of {event.commander} refused: {refusal}")
-            self._effects.append(ev.GoalReport(event.commander, f"refused: {refusal}", is_final=True))
+            text = f"refused: {refusal}"
+            self._effects.append(ev.GoalReport(event.commander, text, is_final=True, goal_id=event.goal_id))
             return
         robot_ns, here, map_id = (
             self._place.robot_ns(self._now_ns),

@@ -51,11 +51,11 @@ class GoalControl:
         """Send a goal; one under way of the same commander is replaced by it."""
         effects: list[ev.RobotEffect] = []
         if self.active is not None:
-            effects.append(ev.GoalReport(self.active.commander, "replaced by a newer goal", is_final=True))
+            effects.append(_report(self.active, "replaced by a newer goal", is_final=True))
         self.active = goal
         where = f"x {goal.T_map_base.x:.2f} y {goal.T_map_base.y:.2f} m"
         effects.append(ev.SendGoal(goal.goal_id, stamp_ns, goal.T_map_base))
-        effects.append(ev.GoalReport(goal.commander, f"sent to the robot: {where}"))
+        effects.append(_report(goal, f"sent to the robot: {where}"))
         return effects
 
     def stop(self, reason: str, now_ns: int) -> list[ev.RobotEffect]:
@@ -66,7 +66,7 @@ class GoalControl:
         self._cancel_timer.postpone(now_ns + seconds_to_ns(_REPEAT_S))
         return [
             ev.CancelGoal(self.active.goal_id),
-            ev.GoalReport(self.active.commander, f"stopping: {reason}"),
+            _report(self.active, f"stopping: {reason}"),
         ]
 
     def take_status(self, event: ev.StatusReceived, now_ns: int) -> list[ev.RobotEffect]:
@@ -102,14 +102,14 @@ class GoalControl:
                 self.active = replace(goal, failed_ns=now_ns)
                 return [ev.AskResult(goal.goal_id)]
             case _:
-                return [ev.GoalReport(goal.commander, status)]
+                return [_report(goal, status)]
 
     def take_feedback(self, event: ev.FeedbackReceived) -> list[ev.RobotEffect]:
         """Tell the commander how far it is."""
         goal = self.active
         if goal is None or event.goal_id != goal.goal_id or not math.isfinite(event.distance_m):
             return []
-        return [ev.GoalReport(goal.commander, f"{event.distance_m:.2f} m to go")]
+        return [_report(goal, f"{event.distance_m:.2f} m to go")]
 
     def take_answer(self, event: ev.GoalAnswered, now_ns: int) -> None:
         """Remember a refusal: it may be that of the goal under way."""
@@ -150,7 +150,7 @@ class GoalControl:
         if now_ns - stopped_ns > seconds_to_ns(_UNCONFIRMED_S) and not goal.is_unconfirmed:
             self.active = replace(goal, is_unconfirmed=True)
             text = "the robot does not confirm that it stops; stop it by hand"
-            effects += [ev.BridgeLine(text), ev.GoalReport(goal.commander, text)]
+            effects += [ev.BridgeLine(text), _report(goal, text)]
         return effects
 
     def _cancel_orphans(self, statuses: dict[bytes, ev.GoalStatus], now_ns: int) -> list[ev.RobotEffect]:
@@ -169,9 +169,13 @@ class GoalControl:
 
     def _end(self, text: str, is_reached: bool = False) -> list[ev.RobotEffect]:
         assert self.active is not None
-        report = ev.GoalReport(self.active.commander, text, is_final=True, is_reached=is_reached)
+        report = _report(self.active, text, is_final=True, is_reached=is_reached)
         self.active = None
         return [report]
 
 
 _UNDER_WAY = (ev.GoalStatus.ACCEPTED, ev.GoalStatus.EXECUTING)
+
+
+def _report(goal: ActiveGoal, text: str, is_final: bool = False, is_reached: bool = False) -> ev.GoalReport:
+    return ev.GoalReport(goal.commander, text, is_final, is_reached, goal.goal_id)

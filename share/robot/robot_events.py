@@ -201,12 +201,14 @@ class LimitSpeed:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """What a commander is told of its goal. is_final: nothing follows. is_reached: it ended there."""
+    """What a commander is told of its goal `goal_id`. is_final: nothing follows. is_reached: it ended
+    there."""
 
     commander: str
     text: str
     is_final: bool = False
     is_reached: bool = False
+    goal_id: bytes = b""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import queue
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -62,6 +62,7 @@ from share.runtime.worker_process import WorkerProcess
 from share.scheduling.policies import POLICIES
 from share.startup import HeapTrimmer
 from share.store.map_store import MapStore
+from share.wire.room_messages import Permission
 
 TICK_MS = 50
 _REPORT_S = 0.1  # period of reports
@@ -105,7 +106,7 @@ class _RecentTroubles:
 
 class EdgeRun:
     """One run of the edge, until `stop`. Writes events.jsonl as events happen and edge.json at the end to
-    `out`."""
+    `out`. allowed: what every client may do where no keys say it."""
 
     def __init__(
         self,
@@ -115,12 +116,13 @@ class EdgeRun:
         on_record: Callable[[dict[str, Any]], None],
         store: MapStore | None = None,
         observers: Sequence[EdgeObserver] = (),
+        allowed: Collection[Permission] = (),
     ) -> None:
+        self._allowed = frozenset(allowed)
         self._settings, self._link, self._on_record = settings, link, on_record
         self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
-        has_keys = link.agent_names("") is not None
-        notify_map = partial(self._log_event, "map")
+        notify_map, has_keys = partial(self._log_event, "map"), link.agent_names("") is not None
         self._restarts = MapperRestarts(store, settings.merge.enter_m, notify_map, has_keys)
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
         self._restart_reason = ""
@@ -246,7 +248,8 @@ class EdgeRun:
         self, restore: RestoreMap | None, known: list[RestoredRun], start_delay_s: float
     ) -> None:
         store, writable = self._restarts.store, self._restarts.writable
-        self._state_machine = Edge(self._settings, secrets.randbits(63), writable, known, self._start_ns)
+        session, objects = secrets.randbits(63), self._restarts.objects or ()
+        self._state_machine = Edge(self._settings, session, writable, known, self._start_ns, objects)
         arguments = (self._settings, None if store is None else store.path)
         self._mapper_process = WorkerProcess(
             "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
@@ -265,7 +268,8 @@ class EdgeRun:
             if message is None:
                 break
             names = self._link.agent_names(message.key)
-            self._handle(PeerMessageReceived(message.peer, message.frames, names, message.key))
+            may = self._allowed if names is None else self._link.permissions(message.key)
+            self._handle(PeerMessageReceived(message.peer, message.frames, names, message.key, may))
         for line in self._link.refusals():
             self._count_refusal(line)
         self._handle_answers()
@@ -323,6 +327,7 @@ class EdgeRun:
             if self._map_writer is not None and not self._map_writer.drain(_DRAIN_S):
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
+            self._restarts.objects = self._state_machine.room.kept_objects()
             loaded = self._load_stored_map()
             report = self._state_machine.report(self._progress.report)
             self._totals.add_session(self._totals.with_totals(report))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from share.errors import ShareError
-from share.mapping.map_changes import with_unknown_credentials
+from share.mapping.map_changes import SaveObject, with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.mapper_process import MapperReport, RestoreMap
 from share.store.forgetting import damaged_copies
@@ -33,6 +33,7 @@ class MapperRestarts:
     ) -> None:
         """known_m: see `share.protocol.peer.restored_runs`. has_keys: agents of this edge have keys."""
         self.store = store  # None also once a read-only map is no longer used
+        self.objects: Sequence[SaveObject] | None = None  # of the room; None before the map was loaded
         self._known_m, self._notify, self._has_keys = known_m, notify, has_keys
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring = False
@@ -80,6 +81,7 @@ class MapperRestarts:
             restore, outline = RestoreMap(self.store.rows(), self._has_keys), self.store.outline()
             outline = with_unknown_credentials(outline) if self._has_keys else outline
             known = restored_runs(outline, self._known_m)
+            self.objects = outline.objects if self.objects is None else self.objects
         except ShareError:
             raise
         except Exception as error:  # no content of a file may end the edge

@@ -13,14 +13,18 @@ from dataclasses import replace
 from share.errors import WireError
 from share.geometry.se3 import inverse
 from share.net.udp import Datagram, StampedSocket
+from share.protocol.room_events import BridgeSaid, RobotCommanded
 from share.robot import robot_events as ev
 from share.robot.bridge import RobotBridge
 from share.robot.goal_control import GOAL_PREFIX
 from share.robot.pose_message import parse_pose_message
 from share.robot.robot_file import RobotDescription
 from share.robot.ros_node import RosNode
+from share.robot.wire_commands import WireCommands
 from share.runtime.robot_commands import CommandServer
+from share.runtime.room_link import RoomLink
 from share.timing import LineLimiter
+from share.wire.room_messages import CommandState
 
 _TICK_S = 0.01  # odometry waits so long at most
 _END_NS = 2_000_000_000
@@ -28,7 +32,7 @@ _MAX_DATAGRAMS = 64  # in one step
 
 
 class RobotBridgeRun:
-    """One bridge until `stop`. print_line: takes lines for a person."""
+    """One bridge until `stop`. print_line: takes lines for a person. room: the edge that sends goals too."""
 
     def __init__(
         self,
@@ -37,8 +41,10 @@ class RobotBridgeRun:
         poses: StampedSocket,
         commands: CommandServer,
         print_line: Callable[[str], None],
+        room: RoomLink | None = None,
     ) -> None:
         self.bridge = RobotBridge(robot.settings)
+        self._room, self._wire = room, WireCommands()
         self._node, self._poses, self._commands, self._print_line = node, poses, commands, print_line
         self._line_limiter = LineLimiter()
         self._is_stopped = False
@@ -71,8 +77,34 @@ class RobotBridgeRun:
             self._handle(event)
         for event in self._commands.poll(self._goal_id):
             self._handle(event)
+        if self._room is not None:
+            self._serve_edge(self._room)
         self._handle(ev.BridgeTick())
         self._commands.show(lambda: self.bridge.report(time.monotonic_ns()), time.monotonic_ns())
+
+    def _serve_edge(self, room: RoomLink) -> None:
+        """Take the commands that have come over the wire, and answer."""
+        now_ns = time.monotonic_ns()
+        for effect in room.step(0):
+            if isinstance(effect, RobotCommanded):
+                self._carry_out(room, *self._wire.take(effect.command, self._goal_id, now_ns))
+        self._carry_out(room, *self._wire.tick(now_ns))
+        place = self._wire.due_place(lambda: self.bridge.report(now_ns), now_ns)
+        if place is not None:
+            room.handle(BridgeSaid(place))
+
+    def _carry_out(self, room: RoomLink, events: list[ev.RobotEvent], states: list[CommandState]) -> None:
+        for state in states:
+            room.handle(BridgeSaid(state))
+        for event in events:
+            self._handle(event)
+
+    def _report(self, report: ev.GoalReport) -> None:
+        self._commands.report(report)
+        if self._room is not None:
+            state = self._wire.report(report, time.monotonic_ns())
+            if state is not None:
+                self._room.handle(BridgeSaid(state))
 
     def _goal_id(self) -> bytes:
         return GOAL_PREFIX + secrets.token_bytes(16 - len(GOAL_PREFIX))
@@ -102,7 +134,7 @@ class RobotBridgeRun:
                 case ev.LimitSpeed():
                     self._node.limit_speed(effect.speed_m_s)
                 case ev.GoalReport():
-                    self._commands.report(effect)
+                    self._report(effect)
                 case ev.BridgeLine():
                     self._print_line(effect.text)
                     self._commands.tell_watchers({"line": effect.text})

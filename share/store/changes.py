@@ -11,10 +11,12 @@ from share.mapping.map_changes import (
     RemoveKeyframes,
     RemoveLoops,
     RemoveRun,
+    RemoveStoredObject,
     SaveCredential,
     SaveKeyframe,
     SaveLink,
     SaveLoop,
+    SaveObject,
     SavePoses,
     SaveRun,
     SaveView,
@@ -59,6 +61,12 @@ def apply_change(db: sqlite3.Connection, change: MapChange, now_s: float) -> Non
         case SavePoses():
             db.execute("DELETE FROM poses")
             insert(db, "poses", rows.poses_row(change))
+        case SaveObject():
+            row = rows.object_row(change)
+            db.execute("DELETE FROM about WHERE name = ?", row[:1])
+            insert(db, "about", row)
+        case RemoveStoredObject(object_id):
+            db.execute("DELETE FROM about WHERE name = ?", (rows.object_name(object_id),))
 
 
 def _insert_run(db: sqlite3.Connection, change: SaveRun) -> None:

@@ -177,6 +177,7 @@ def _outline(read_rows: ReadRows) -> StoredMap:
         tuple(rows.read_loop(row) for row in tables["loop"]),
         solved,
         {key: max(next_ids[key], newest.get(key, -1) + 1) for key in runs},
+        objects=rows.read_objects(read_rows.tables["about"]),
     )
 
 
@@ -220,6 +221,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _present_poses(poses[0], known_keys) if poses else None,
         _next_ids(next_ids, repaired.keyframes),
         tuple(line for line in complaints if line),
+        rows.read_objects(read_rows.tables["about"]),
     )
 
 

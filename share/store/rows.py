@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sqlite3
 import zlib
@@ -12,13 +13,22 @@ import msgspec
 import numpy as np
 
 from share.agent_names import checked_run_key
-from share.checks import checked_cov, checked_id, checked_pose
+from share.checks import checked_cov, checked_id, checked_map_id, checked_pose
 from share.errors import StoreError
 from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.map_changes import SaveKeyframe, SaveLink, SavePoses, SaveRun, SaveView, StoredKeyframe
+from share.mapping.map_changes import (
+    SaveKeyframe,
+    SaveLink,
+    SaveObject,
+    SavePoses,
+    SaveRun,
+    SaveView,
+    StoredKeyframe,
+)
 from share.types import F64, U8, Keyframe
 from share.vision.packed_view import PackedView
 from share.wire import codec, messages
+from share.wire.room_messages import ObjectKind, RoomObject
 
 M = TypeVar("M")
 Row = tuple[Any, ...]  # columns as in COLUMNS, without number and crc
@@ -37,8 +47,16 @@ COLUMNS = {
     "view": ("run", "id", "view"),
 }
 
+_OBJECT_PREFIX = "object "  # before an object's id, a name in `about`; an older SHARE ignores it
 _CREDENTIAL_PREFIX = "voice "  # before a run's key, a name in `about`; SHARE 0.1 ignores it
-_READABLE_VERSIONS = (3, 4, 5, 6, codec.WIRE_VERSION)  # wire versions with today's Hello and a known Keyframe
+_READABLE_VERSIONS = (
+    3,
+    4,
+    5,
+    6,
+    7,
+    codec.WIRE_VERSION,
+)  # wire versions with today's Hello and a known Keyframe
 _pack = msgspec.msgpack.encode
 _decode_frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _decode_pose_keys = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
@@ -78,6 +96,24 @@ def run_row(run: SaveRun, next_keyframe: int) -> Row:
 def credential_row(run: str, credential: str) -> Row:
     """Return the row of `about` with the public key of a run. A run without a key has no row."""
     return _CREDENTIAL_PREFIX + run, credential
+
+
+def object_name(object_id: int) -> str:
+    """Return the name in `about` of an object of the room."""
+    return f"{_OBJECT_PREFIX}{object_id}"
+
+
+def object_row(stored: SaveObject) -> Row:
+    """Return the row of `about` with an object of the room: JSON."""
+    one = stored.object
+    fields = {
+        "kind": one.kind,
+        "owner": one.owner,
+        "map": one.map_id,
+        "home": stored.home_map,
+        "T": one.T_map_object.tolist(),
+    }
+    return object_name(one.object_id), msgspec.json.encode(fields).decode()
 
 
 def keyframe_row(keyframe: SaveKeyframe, segment: int, ordinal: int) -> Row:
@@ -130,6 +166,27 @@ def read_credentials(about: list[tuple[int, Row]]) -> dict[str, str]:
         for name, value in texts.items()
         if name.startswith(_CREDENTIAL_PREFIX)
     }
+
+
+class _ObjectFields(msgspec.Struct):
+    kind: ObjectKind
+    owner: str
+    map: str
+    home: str
+    T: list[list[float]]
+
+
+def read_objects(about: list[tuple[int, Row]]) -> tuple[SaveObject, ...]:
+    """Return the objects of the room, from the rows of `about`; one that cannot be read is left out."""
+    out = []
+    for _, (name, value) in about:
+        if isinstance(name, str) and isinstance(value, str) and name.startswith(_OBJECT_PREFIX):
+            with contextlib.suppress(ValueError, msgspec.MsgspecError):
+                fields = msgspec.json.decode(value, type=_ObjectFields)
+                object_id, T = int(name.removeprefix(_OBJECT_PREFIX)), np.array(fields.T, np.float64)
+                one = RoomObject(0, 0, object_id, fields.kind, fields.owner, fields.map, T)
+                out.append(SaveObject(one, checked_map_id(fields.home)))
+    return tuple(out)
 
 
 def read_keyframe(row: Row) -> StoredKeyframe:

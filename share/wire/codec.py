@@ -18,7 +18,7 @@ from share.errors import VersionError, WireError, printable
 from share.wire import messages as m
 from share.wire.layouts import KEYFRAME_WITHOUT_IMAGE, LAYOUT_BY_CODE, LAYOUTS, Bytes, Header, encode_plain
 
-WIRE_VERSION = 7
+WIRE_VERSION = 8
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
 MAX_HEADER_BYTES = 4096
 _IMAGE_VERSION = 6  # of the first keyframes with an image; map files keep older ones

@@ -43,6 +43,7 @@ from share.types import (
     WaitReason,
 )
 from share.wire import messages as m
+from share.wire import room_messages as r
 
 MAX_ARRAYS = 16
 MAX_FRAME_BYTES = max(MAX_KEYPOINTS * DESCRIPTOR_BYTES, MAX_JPEG_BYTES)  # of all messages but Frame
@@ -55,6 +56,8 @@ Text = Annotated[str, Meta(max_length=m.MAX_TEXT_LENGTH)]
 Reason = Annotated[str, Meta(max_length=m.MAX_REASON_LENGTH)]
 Name = Annotated[str, Meta(max_length=MAX_NAME_LENGTH)]
 MapId = Annotated[str, Meta(max_length=MAX_MAP_ID_LENGTH)]
+Answer = Annotated[str, Meta(max_length=r.MAX_ANSWER_LENGTH)]
+Listed = Annotated[tuple[Int64, ...], Meta(max_length=r.MAX_LISTED)]
 
 _DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
 
@@ -330,6 +333,46 @@ LAYOUTS: dict[type, MessageLayout] = {
         new_segment=bool,
         is_consistent=bool,
         waiting_for=WaitReason | None,
+    ),
+}
+_PARTIES: dict[str, Any] = {"command": Int64, "robot": Name | None, "commander": Name}
+_PLACE: dict[str, Any] = {"map_id": MapId | None, "x": float, "y": float}
+LAYOUTS |= {  # of clients: docs/lookup/wire.md#clients
+    r.ClientHello: MessageLayout(
+        32, r.ClientHello, name=Name, run_id=Int64, drives_robot=bool, wants_objects=bool, wants_robots=bool
+    ),
+    r.PutObject: MessageLayout(
+        33,
+        r.PutObject,
+        _pose("T_map_object"),
+        request=Int64,
+        object_id=Int64,
+        kind=r.ObjectKind,
+        map_id=MapId | None,
+    ),
+    r.RemoveObject: MessageLayout(34, r.RemoveObject, request=Int64, object_id=Int64),
+    r.ObjectsSeen: MessageLayout(35, r.ObjectsSeen, session=Int64, revision=Int64),
+    r.Goto: MessageLayout(36, r.Goto, **_PARTIES, **_PLACE, yaw=float | None, has_begun=bool),
+    r.Cancel: MessageLayout(37, r.Cancel, **_PARTIES),
+    r.CommandState: MessageLayout(
+        38, r.CommandState, **_PARTIES, text=Answer, is_final=bool, is_reached=bool
+    ),
+    r.RobotPlace: MessageLayout(39, r.RobotPlace, robot=Name | None, **_PLACE, yaw=float, text=Answer),
+    r.Receipt: MessageLayout(48, r.Receipt, request=Int64, reason=Answer),
+    r.RoomObject: MessageLayout(
+        49,
+        r.RoomObject,
+        _pose("T_map_object"),
+        session=Int64,
+        revision=Int64,
+        object_id=Int64,
+        kind=r.ObjectKind,
+        owner=Name,
+        map_id=MapId,
+        removed=Answer,
+    ),
+    r.ObjectList: MessageLayout(
+        50, r.ObjectList, session=Int64, revision=Int64, ids=Listed, revisions=Listed
     ),
 }
 MESSAGE_CODES = {message_type: layout.code for message_type, layout in LAYOUTS.items()}

@@ -13,6 +13,7 @@ from share.agent_names import checked_name
 from share.checks import checked_id, checked_pose, checked_stamp
 from share.geometry.camera import Camera, Rig
 from share.types import F64, AgentKind, Correction, Frame, Keyframe, TrackState, WaitReason
+from share.wire.room_messages import ClientDownlink, ClientUplink
 
 MAX_RATE_HZ = 1000.0
 MIN_POSE_HZ = 1.0
@@ -263,4 +264,5 @@ class RemoteTrackingResult:
 
 UplinkMessage = Hello | PoseUpdate | Keyframe | Evaluation | Status | Ping | Bye | Frame
 DownlinkMessage = Welcome | Refused | Ack | Correction | Rate | Pong | RemoteTrackingResult
-Message = UplinkMessage | DownlinkMessage
+# Goto, Cancel, CommandState and RobotPlace go both ways: the edge passes them on
+Message = UplinkMessage | DownlinkMessage | ClientUplink | ClientDownlink

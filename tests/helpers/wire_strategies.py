@@ -33,6 +33,7 @@ from share.types import (
     WaitReason,
 )
 from share.wire import messages as m
+from share.wire import room_messages as r
 
 
 def is_name(text: str) -> bool:
@@ -161,7 +162,29 @@ def rigs(draw: st.DrawFn) -> Rig:
     )
 
 
+numbers = st.integers(0, 2**62)
+answers = st.text(st.characters(categories=["L", "N"]), max_size=r.MAX_ANSWER_LENGTH)
+kinds, floors = st.sampled_from(r.ObjectKind), st.floats(-r.MAX_PLACE_M, r.MAX_PLACE_M)
+turns, commanders = st.floats(-6.28, 6.28), st.just("") | names
+lists = st.lists(st.tuples(ids, numbers), max_size=r.MAX_LISTED).map(
+    lambda rows: tuple(zip(*rows, strict=True)) or ((), ())
+)
+parties = numbers, st.none() | names, commanders
+of_clients = st.one_of(
+    st.builds(r.ClientHello, names, int64, st.booleans(), st.booleans(), st.booleans()),
+    st.builds(r.PutObject, numbers, ids, kinds, st.none() | words, poses(r.MAX_PLACE_M)),
+    st.builds(r.RemoveObject, numbers, ids),
+    st.builds(r.ObjectsSeen, int64, numbers),
+    st.builds(r.Goto, *parties, st.none() | words, floors, floors, st.none() | turns, st.booleans()),
+    st.builds(r.Cancel, *parties),
+    st.builds(r.CommandState, *parties, answers, st.booleans(), st.booleans()),
+    st.builds(r.RobotPlace, st.none() | names, st.none() | words, floors, floors, turns, answers),
+    st.builds(r.Receipt, numbers, answers),
+    st.builds(r.RoomObject, int64, numbers, ids, kinds, names, words, poses(), answers),
+    st.builds(lambda s, n, rows: r.ObjectList(s, n, *rows), int64, numbers, lists),
+)
 messages = st.one_of(
+    of_clients,
     st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, rigs(), st.booleans()),
     st.builds(m.PoseUpdate, stamps, st.sampled_from(TrackState), ids_or_none, poses()),
     keyframes(),

@@ -10,7 +10,18 @@ import pytest
 import share
 
 HEAVY = ["numpy", "cv2", "scipy", "zmq", "click", "yaml", "msgspec", "onnxruntime", "rosbags", "mcap"]
-NAMES = {"Tracker", "Frame", "Pose", "Rig", "load_calibration", "open_recording", "Agent", "Edge", "Config"}
+NAMES = {
+    "Tracker",
+    "Frame",
+    "Pose",
+    "Rig",
+    "load_calibration",
+    "open_recording",
+    "Agent",
+    "Edge",
+    "Config",
+    "Room",
+}
 
 
 def test_the_interface_has_these_names_and_no_other():

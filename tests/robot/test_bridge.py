@@ -163,7 +163,9 @@ def test_what_comes_back_is_published_again_but_no_goal_goes_on(drive: RobotDriv
     drive.goals = [(goal_id, ev.GoalStatus.CANCELED)]
     drive.state = TrackState.OK
     drive.run(0.5)
-    assert drive.last_report == ev.GoalReport("ann", "stopped: bot has lost tracking (LOST)", is_final=True)
+    assert drive.last_report == ev.GoalReport(
+        "ann", "stopped: bot has lost tracking (LOST)", is_final=True, goal_id=drive.last_report.goal_id
+    )
     assert [e for e in drive.run(0.5) if isinstance(e, ev.PublishMapOdom)]
     assert len(drive.of(ev.SendGoal)) == 1
 
@@ -344,7 +346,9 @@ def test_a_cancellation_is_repeated_until_the_robot_confirms_it(drive: RobotDriv
     assert drive.last_report.text == "the robot does not confirm that it stops; stop it by hand"
     drive.goals = [(goal_id, ev.GoalStatus.CANCELED)]
     drive.run(0.2)
-    assert drive.last_report == ev.GoalReport("ann", "stopped: cancelled by bob", is_final=True)
+    assert drive.last_report == ev.GoalReport(
+        "ann", "stopped: cancelled by bob", is_final=True, goal_id=drive.last_report.goal_id
+    )
 
 
 @pytest.mark.parametrize("has_reason", [True, False])

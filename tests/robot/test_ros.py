@@ -11,6 +11,7 @@ import json
 import math
 import os
 import queue
+import re
 import signal
 import socket
 import subprocess
@@ -25,7 +26,9 @@ import numpy as np
 import pytest
 import yaml
 from helpers.robot_drive import T_BASE_BODY, solid
+from helpers.room_server import RoomServer
 
+from share import Room as ShareRoom
 from share.geometry.se3 import inverse
 from share.net.udp import HostPort, StampedSocket
 from share.robot import robot_events as ev
@@ -34,6 +37,7 @@ from share.robot.robot_file import RobotDescription
 from share.robot.settings import RobotSettings
 from share.runtime.pose import Pose
 from share.runtime.pose_feed import PoseMessages
+from share.runtime.room_link import RoomLink
 from share.types import TrackState
 
 ROS = os.environ.get("SHARE_ROS")
@@ -137,6 +141,7 @@ class Room:
         drive_s: float = 2.0,
         fault: str = "",
         robots: tuple[str, ...] | None = None,
+        edge: str | None = None,
     ) -> None:
         from share.robot.ros_node import RosNode
         from share.runtime.robot_bridge import RobotBridgeRun
@@ -152,8 +157,9 @@ class Room:
         self.node = RosNode(domain, namespace, [])
         settings = RobotSettings(inverse(T_BASE_BODY), allow_goals=True)
         self.printed: list[str] = []
+        self.link = None if edge is None else RoomLink(edge, "bot", drives_robot=True)
         self.run_ = RobotBridgeRun(
-            RobotDescription(settings), self.node, self.poses, self.commands, self.printed.append
+            RobotDescription(settings), self.node, self.poses, self.commands, self.printed.append, self.link
         )
         self.reports: list[ev.GoalReport] = []
         self.commands.report = self.reports.append  # type: ignore[method-assign]
@@ -199,6 +205,8 @@ class Room:
     def close(self) -> None:
         for robot in self.robots:
             robot.end()
+        if self.link is not None:
+            self.link.close()
         self.node.close()
         self.commands.close()
         self.poses.close()
@@ -277,6 +285,34 @@ def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., Room]
     assert texts[-1] == "reached" and any("to go" in text for text in texts)
     assert here.robot.of("goal") == [{"goal": [1.5, 0.5], "frame": "map"}]
     assert here.robot.of("speed_limit")[-1]["speed_limit"] == 0.2
+
+
+def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+    """A commander at an edge, the edge, the bridge, the robot's action server, and the states back."""
+    count = int(os.environ.get("SHARE_ROS_GOALS", "3"))
+    took_ms = []
+    with RoomServer() as server, ShareRoom(server.address, "ann") as ann:
+        here = room(drive_s=20.0, edge=server.address)
+        assert here.run(5.0, lambda: here.link.client.is_connected)
+        for k in range(count):
+            here.robot.forget()
+            began = time.perf_counter()
+            goal = ann.goto(1.0 + 0.1 * k, 0.5)
+            assert here.run(10.0, lambda goal=goal: re.match("accepted|executing|.* to go", goal.text)), (
+                goal.text
+            )
+            took_ms.append(1e3 * (time.perf_counter() - began))
+            # a server of rclpy never ends a goal that is cancelled before it executes
+            assert here.run(10.0, lambda goal=goal: goal.text.endswith("to go")), goal.text
+            goal.cancel()
+            assert here.run(10.0, lambda goal=goal: goal.is_final), goal.text
+            assert goal.text == "stopped: cancelled by 'ann'"
+            assert here.run(5.0, lambda: here.robot.of("ended"))
+            assert here.robot.of("goal") == [{"goal": [pytest.approx(1.0 + 0.1 * k), 0.5], "frame": "map"}]
+    print(
+        f"\ngoto over the wire → accepted, seen by the commander ({messages[0]}): median "
+        f"{np.median(took_ms):.0f} ms, worst {max(took_ms):.0f}, n {count}, load {os.getloadavg()[0]:.1f}"
+    )
 
 
 def test_cancel(room: Callable[..., Room]) -> None:

@@ -31,9 +31,20 @@ KINDS = {
     "rate": 20,
     "pong": 21,
     "tracked": 22,
+    "client": 32,
+    "put": 33,
+    "remove": 34,
+    "seen": 35,
+    "goto": 36,
+    "cancel": 37,
+    "state": 38,
+    "place": 39,
+    "receipt": 48,
+    "object": 49,
+    "objects": 50,
 }
-UP = tuple(list(KINDS)[:7])
-DOWN = tuple(list(KINDS)[7:])
+UP = tuple(name for name, code in KINDS.items() if code < 16 or 32 <= code < 48)
+DOWN = tuple(name for name in KINDS if name not in UP)
 NAMES = {code: name for name, code in KINDS.items()}
 
 
@@ -83,12 +94,12 @@ class Corpus:
         for kind, made in _made_up(version).items():
             self.by_kind[kind] = self.by_kind[kind] or [made]
 
-    def hello(self, name: str, identity: bytes) -> Message:
-        """A valid one, of another name and run."""
-        header, *arrays = self.by_kind["hello"][0]
+    def hello(self, name: str, identity: bytes, kind: str = "hello") -> Message:
+        """A valid one, of another name and run. kind: hello of an agent, or client."""
+        header, *arrays = self.by_kind[kind][0]
         fields = unpack(header)
         scalars = fields[2]  # type: ignore[index]
-        scalars[0], scalars[2] = name, int.from_bytes(identity, "big", signed=True)
+        scalars[0], scalars[2 if kind == "hello" else 1] = name, int.from_bytes(identity, "big", signed=True)
         return [pack(fields), *arrays]
 
 
@@ -111,6 +122,17 @@ def _made_up(version: int) -> dict[str, Message]:
             bytes(24),
             bytes(24),
         ],
+        "client": [pack([version, 32, ["eve", 77, False, True, True], []])],
+        "put": [pack([version, 33, [9, 3, "cube", "ann-1234/0"], pose]), eye],
+        "remove": [pack([version, 34, [10, 3], []])],
+        "seen": [pack([version, 35, [1, 2], []])],
+        "goto": [pack([version, 36, [11, "bot", "", "ann-1234/0", 1.0, 2.0, 0.5, False], []])],
+        "cancel": [pack([version, 37, [12, "bot", ""], []])],
+        "state": [pack([version, 38, [11, None, "ann", "1.20 m to go", False, False], []])],
+        "place": [pack([version, 39, [None, "ann-1234/0", 1.0, 2.0, 0.5, ""], []])],
+        "receipt": [pack([version, 48, [9, ""], []])],
+        "object": [pack([version, 49, [1, 2, 3, "cube", "ann", "ann-1234/0", ""], pose]), eye],
+        "objects": [pack([version, 50, [1, 2, [3], [2]], []])],
         "refused": [pack([version, 17, ["no"], []])],
         "rate": [pack([version, 20, [3.0, True, None], []])],
         "tracked": [pack([version, 22, [0, 10, "OK", False, False, True, None], pose]), eye],

@@ -28,7 +28,7 @@ from typing import Any, Protocol
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from corpus import KINDS, Corpus, Recorded, write
+from corpus import KINDS, UP, Corpus, Recorded, write
 from mutations import mutate
 from raw_wire import Message, RawPeer, pack, unpack
 
@@ -157,7 +157,7 @@ class Attacker:
 
     @property
     def _mutates_hellos(self) -> bool:
-        return self.args.kind == "hello" and not self.args.valid
+        return self.args.kind in ("hello", "client") and not self.args.valid
 
     def _speaker(self, run: Run) -> Speaker:
         """Its connection, made if it has none. Raises OSError."""
@@ -166,10 +166,14 @@ class Attacker:
             self.counts["connections"] += 1
         if time.monotonic() - run.hello_at > HELLO_EVERY_S and not self._mutates_hellos:
             run.hello_at = time.monotonic()
-            hello = self.corpus.hello(own_name(run.identity, self.args.keys), run.identity)
+            hello = self._hello(own_name(run.identity, self.args.keys), run.identity)
             self.ring.append(Recorded(run.identity, True, hello))
             run.speaker.send([hello])
         return run.speaker
+
+    def _hello(self, name: str, identity: bytes) -> Message:
+        """A valid one: of a client for the kinds that only clients send."""
+        return self.corpus.hello(name, identity, "client" if 32 <= KINDS[self.args.kind] < 48 else "hello")
 
     def _hear(self, run: Run, messages: list[Message]) -> None:
         for parts in messages:
@@ -197,22 +201,22 @@ class Attacker:
         if self.args.valid:
             return self._valid(identity)
         message = self.draw.choice(self.small)
-        if self.args.kind == "hello":
+        if self._mutates_hellos:
             any_name = f"m{self.draw.randrange(10**6)}"
             name = any_name if self.draw.random() < 0.3 else own_name(identity, self.args.keys)
-            message = self.corpus.hello(name, identity)
+            message = self._hello(name, identity)
         return mutate(self.draw, message)
 
     def _said_validly(self) -> list[Message]:
         """What an agent of that kind might say as often: for a Frame a pose, for what an edge says a ping."""
         kind = {"frame": "pose", "bye": "ping"}.get(self.args.kind, self.args.kind)
-        if KINDS[kind] >= 16:
+        if kind not in UP:
             kind = "ping"
         return _small(self.corpus.by_kind[kind][:50], kind)
 
     def _valid(self, identity: bytes) -> Message:
-        if self.args.kind == "hello":  # its own
-            return self.corpus.hello(own_name(identity, self.args.keys), identity)
+        if self.args.kind in ("hello", "client"):  # its own
+            return self._hello(own_name(identity, self.args.keys), identity)
         return self.draw.choice(self.valid)
 
 

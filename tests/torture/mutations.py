@@ -169,7 +169,7 @@ def _shape(draw: random.Random, fields: list[Any]) -> None:
 def _form(draw: random.Random, fields: list[Any]) -> None:
     match draw.randrange(5):
         case 0:
-            fields[1] = draw.choice((0, *range(1, 24), 255, 2**31, -1))
+            fields[1] = draw.choice((0, *range(1, 24), *range(31, 52), 255, 2**31, -1))
         case 1:
             fields[0] = draw.choice((0, 1, 3, 5, 255, 2**63, -1, "4", None))
         case 2:

@@ -34,13 +34,14 @@ from share.types import (
 )
 from share.wire import codec, layouts
 from share.wire import messages as m
+from share.wire import room_messages as r
 
 POSE = np.eye(4)
 V = codec.WIRE_VERSION
 CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0, (-0.28, 0.07, 2e-4, 1.8e-5))
 BESIDE = np.block([[np.eye(3), np.array([[-0.05], [0], [0]])], [0, 0, 0, 1]])
 STEREO = Rig(CAMERA, POSE, CAMERA, BESIDE, imu=ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0), timeshift_s=0.01)
-EVERY_CLASS = {*m.UplinkMessage.__args__, *m.DownlinkMessage.__args__}
+EVERY_CLASS = set(m.Message.__args__)
 
 
 def keyframe(n: int, id_: int = 7) -> Keyframe:
@@ -87,6 +88,20 @@ EXAMPLES: list[m.Message] = [
     frame(False),
     m.RemoteTrackingResult(4, 10**18, TrackState.OK, POSE, is_keyframe=True),
     m.RemoteTrackingResult(5, 10**18, TrackState.INITIALISING, None, waiting_for=WaitReason.TILT),
+    r.ClientHello("ann", 2**62, wants_objects=True),
+    r.PutObject(2**40, 7, r.ObjectKind.MARKER, "ann-1a2b/0", POSE),
+    r.PutObject(2**40, 7, r.ObjectKind.CUBE, None, POSE),
+    r.RemoveObject(2**40, 7),
+    r.ObjectsSeen(2**62, 12),
+    r.Goto(2**60, "bot", "ann", "ann-1a2b/0", 1.5, -2.0, 0.5, has_begun=True),
+    r.Goto(2**60, None, "", None, 1.5, -2.0),
+    r.Cancel(2**60, "bot"),
+    r.CommandState(2**60, "bot", "ann", "1.20 m to go"),
+    r.RobotPlace("bot", "ann-1a2b/0", 1.0, 2.0, 3.0, ""),
+    r.RobotPlace(None, None, 0.0, 0.0, 0.0, "the agent has lost tracking"),
+    r.Receipt(2**40, "there are 64 objects already"),
+    r.RoomObject(2**62, 12, 7, r.ObjectKind.CUBE, "ann", "ann-1a2b/0", POSE, "removed by 'bob'"),
+    r.ObjectList(2**62, 12, (7, 9), (12, 3)),
 ]
 
 

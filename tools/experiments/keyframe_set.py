@@ -33,7 +33,7 @@ __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 
 # increase it when any keyframe changes (image, depth, odometry); the recipe has the emulator's version
 VERSION = 4
-_READABLE = (6, WIRE_VERSION)  # wire versions with these keyframes
+_READABLE = (6, 7, WIRE_VERSION)  # wire versions with these keyframes
 
 
 def place(recipe: SessionRecipe, every: Spacing, cache: Path | None = None) -> Path:

@@ -1,0 +1,156 @@
+"""The edge's part in commanding robots: it checks who may, and passes on. The bridge decides what is safe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from share.errors import printable
+from share.geometry import se3
+from share.protocol.edge_events import PeerMessageReceived
+from share.protocol.edge_records import EdgeOutput
+from share.protocol.known_maps import KnownMaps
+from share.protocol.room_clients import Client, ClientRegistry, permission_objection
+from share.wire.room_messages import (
+    MAX_ANSWER_LENGTH,
+    Cancel,
+    CommandState,
+    Goto,
+    Permission,
+    RobotPlace,
+)
+
+
+class CommandDesk:
+    """Passes commands to the bridges of robots, and what they say to commanders and all that want robots.
+
+    places: where each robot was last."""
+
+    def __init__(self, out: EdgeOutput, clients: ClientRegistry, maps: KnownMaps) -> None:
+        self._out, self._clients, self._maps = out, clients, maps
+        self.places: dict[str, RobotPlace] = {}
+
+    def on_command(self, event: PeerMessageReceived, client: Client, command: Goto | Cancel) -> None:
+        """Pass a command on, or answer why not."""
+        now_ns = self._out.now_ns
+        if not self._clients.commands.bucket(client.name, now_ns).take(now_ns):
+            client.count("over_rate", "more commands than 10 a second", now_ns)
+            return
+        if (final := client.commands.get(command.command)) is not None:
+            self._clients.send(client, final)
+            return
+        is_new = command.command not in client.commands
+        if is_new and command.command < client.newest_command:
+            self._end(client, command, "overtaken by a later command")
+            return
+        robot = command.robot or self._only_robot()
+        bridge = None if robot is None else self._clients.bridge(robot)
+        objection = self._objection(event, client, command, bridge)
+        client.remember_command(command.command)
+        if objection is not None:
+            self._end(client, command, self._clients.refuse(client, "refused", objection))
+        elif bridge is None:  # the repetition finds it when it is back; the robot stops by itself meanwhile
+            text = f"robot '{robot or '?'}' is not connected"
+            self._clients.send(client, CommandState(command.command, command.robot, client.name, text))
+        else:
+            if is_new:
+                self._record(client, command, bridge.name)
+            passed = replace(command, robot=bridge.name, commander=client.name)
+            self._clients.send(bridge, self._in_present_map(passed))
+
+    def _objection(
+        self, event: PeerMessageReceived, client: Client, command: Goto | Cancel, bridge: Client | None
+    ) -> str | None:
+        """Return why a command is not passed on; None if it is, or may be as soon as the robot is back."""
+        if isinstance(command, Goto):
+            objection = permission_objection(client.name, Permission.COMMANDS, event)
+            if objection is not None or command.has_begun:
+                return objection
+        if bridge is not None:
+            return None
+        robots = self._clients.robots()
+        if command.robot is None and len(robots) > 1:
+            return f"there are {len(robots)} robots; name one of {', '.join(robots)}"
+        named = "no robot" if command.robot is None else f"no robot '{command.robot}'"
+        others = f"; there is {', '.join(robots)}" if robots else ""
+        return f"{named} is connected: start its bridge with --edge{others}"
+
+    def _only_robot(self) -> str | None:
+        robots = self._clients.robots()
+        return robots[0] if len(robots) == 1 else None
+
+    def _in_present_map(self, command: Goto | Cancel) -> Goto | Cancel:
+        """Return a goal in the map that stands in the place of its own; else as it is: the bridge refuses."""
+        if not isinstance(command, Goto) or command.map_id is None or command.map_id in self._maps:
+            return command
+        R = se3.so3_exp(np.array([0.0, 0.0, command.yaw or 0.0]))
+        placed = self._maps.place(command.map_id, se3.from_rt(R, np.array([command.x, command.y, 0.0])))
+        if placed is None:
+            return command
+        map_id, T = placed
+        yaw = None if command.yaw is None else math.atan2(float(T[1, 0]), float(T[0, 0]))
+        try:
+            return replace(command, map_id=map_id, x=float(T[0, 3]), y=float(T[1, 3]), yaw=yaw)
+        except ValueError:
+            return command
+
+    def _record(self, client: Client, command: Goto | Cancel, robot: str) -> None:
+        where = "stops" if isinstance(command, Cancel) else f"to x {command.x:.2f} y {command.y:.2f} m"
+        self._out.record("robot commanded", None, f"'{client.name}' sends robot '{robot}': {where}")
+
+    def _end(self, client: Client, command: Goto | Cancel, reason: str) -> None:
+        text = printable(f"refused: {reason}")[:MAX_ANSWER_LENGTH]
+        final = CommandState(command.command, command.robot, client.name, text, is_final=True)
+        client.remember_command(command.command, final)
+        self._clients.send(client, final)
+
+    # ------------------------------------------------------------ from bridges
+
+    def on_state(self, bridge: Client, state: CommandState) -> None:
+        """Pass on what becomes of a command."""
+        if not self._may_say(bridge):
+            return
+        state = replace(state, robot=bridge.name)
+        for client in self._clients:
+            if client.name == state.commander and state.command in client.commands:
+                if state.is_final and client.commands[state.command] is None:
+                    said = f"robot '{bridge.name}', sent by '{client.name}': {state.text}"
+                    self._out.record("robot answered", None, said)
+                client.remember_command(state.command, state if state.is_final else None)
+                self._clients.send(client, state)
+            elif client.hello.wants_robots:
+                self._clients.send(client, state)
+
+    def on_place(self, bridge: Client, place: RobotPlace) -> None:
+        """Remember where a robot is, and tell all that want it."""
+        if not self._may_say(bridge):
+            return
+        self.places[bridge.name] = place = replace(place, robot=bridge.name)
+        for client in self._clients:
+            if client.hello.wants_robots:
+                self._clients.send(client, place)
+
+    def _may_say(self, bridge: Client) -> bool:
+        now_ns = self._out.now_ns
+        if not bridge.hello.drives_robot:
+            bridge.count("unexpected", "states of a robot from a client that drives none", now_ns)
+            return False
+        if self._clients.states.bucket(bridge.name, now_ns).take(now_ns):
+            return True
+        bridge.count("over_rate", "more states of a robot than 20 a second", now_ns)
+        return False
+
+    def report(self) -> Mapping[str, object]:
+        """Return where the robots with a bridge are, as plain data."""
+        self.places = {name: one for name, one in self.places.items() if name in self._clients.robots()}
+        return {
+            name: {
+                "map_id": one.map_id,
+                "pose": None if one.map_id is None else [one.x, one.y, one.yaw],
+                "text": one.text,
+            }
+            for name, one in self.places.items()
+        }

@@ -1,0 +1,129 @@
+"""Commands that come to a robot's bridge over the wire: each begun once, held while it is repeated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from share.errors import printable
+from share.robot import robot_events as ev
+from share.timing import PeriodicTimer, seconds_to_ns
+from share.wire.room_messages import (
+    MAX_ANSWER_LENGTH,
+    MAX_PLACE_M,
+    Cancel,
+    CommandState,
+    Goto,
+    RobotPlace,
+)
+
+LEASE_S = 3.0  # a goal that is not repeated for so long is given up: commander, edge or network are gone
+_MAX_KNOWN = 64  # commands; the oldest final one is forgotten
+_PROGRESS_S = 0.25  # between two reports on the way
+_PLACE_S = 0.5
+
+
+@dataclass
+class _KnownCommand:
+    goal_id: bytes
+    state: CommandState
+    repeated_ns: int
+    is_told: bool = True  # its state was sent
+
+
+class WireCommands:
+    """Turns commands into events of the bridge, and its reports into states. Commands go by commander and
+    number: each is used once."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, int], _KnownCommand] = {}
+        self._progress_timer, self._place_timer = PeriodicTimer(_PROGRESS_S), PeriodicTimer(_PLACE_S)
+
+    def take(
+        self, command: Goto | Cancel, make_goal_id: Callable[[], bytes], now_ns: int
+    ) -> tuple[list[ev.RobotEvent], list[CommandState]]:
+        """Return the events of a command, and the states to send. make_goal_id: makes the id of a goal."""
+        key = command.commander, command.command
+        if (known := self._known.get(key)) is not None:
+            known.repeated_ns, known.is_told = now_ns, True
+            return [], [known.state]
+        events: list[ev.RobotEvent] = []
+        goal_id, text, is_reached = b"", "", False
+        commander = commander_text(command.commander)
+        if isinstance(command, Cancel):
+            events, text, is_reached = [ev.CancelRequested(commander)], "cancelled", True
+        elif command.has_begun:
+            text = "stopped: the robot's bridge was restarted; give the goal again"
+        elif not self._make_room():
+            text = "refused: too many goals under way"
+        else:
+            goal_id = make_goal_id()
+            place = command.x, command.y, command.yaw, command.map_id
+            events = [ev.GotoRequested(commander, goal_id, *place)]
+        is_final = not goal_id
+        state = CommandState(command.command, None, command.commander, text or "taken", is_final, is_reached)
+        self._make_room()
+        self._known[key] = _KnownCommand(goal_id, state, now_ns)
+        return events, [state] if is_final else []
+
+    def report(self, report: ev.GoalReport, now_ns: int) -> CommandState | None:
+        """Take a report of the bridge; return the state to send now, if it is about a command of the wire."""
+        known = next((one for one in self._known.values() if one.goal_id == report.goal_id != b""), None)
+        if known is None:
+            return None
+        state, text = known.state, printable(report.text)[:MAX_ANSWER_LENGTH]
+        if state.is_final:
+            return None
+        known.state = CommandState(
+            state.command, None, state.commander, text, report.is_final, report.is_reached
+        )
+        is_step = report.is_final or state.text == "taken" or report.text in set(ev.GoalStatus)
+        known.is_told = is_step or self._progress_timer.fire_if_due(now_ns)
+        return known.state if known.is_told else None
+
+    def tick(self, now_ns: int) -> tuple[list[ev.RobotEvent], list[CommandState]]:
+        """Give up goals that are not repeated; return states on the way that were held back."""
+        events: list[ev.RobotEvent] = []
+        for known in self._known.values():
+            if not known.state.is_final and now_ns - known.repeated_ns > seconds_to_ns(LEASE_S):
+                known.repeated_ns = now_ns  # said again where the robot goes on
+                events.append(ev.CommanderLost(commander_text(known.state.commander)))
+        held = [known for known in self._known.values() if not known.is_told]
+        if not held or not self._progress_timer.fire_if_due(now_ns):
+            return events, []
+        for known in held:
+            known.is_told = True
+        return events, [known.state for known in held]
+
+    def due_place(self, report: Callable[[], dict[str, Any]], now_ns: int) -> RobotPlace | None:
+        """Return where the robot is, twice a second. report: of the bridge."""
+        return robot_place(report()) if self._place_timer.fire_if_due(now_ns) else None
+
+    def _make_room(self) -> bool:
+        """Forget the oldest final command of too many. Return whether there is room."""
+        if len(self._known) < _MAX_KNOWN:
+            return True
+        final = next((key for key, one in self._known.items() if one.state.is_final), None)
+        if final is None:
+            return False
+        del self._known[final]
+        return True
+
+
+def commander_text(name: str) -> str:
+    """Return how the bridge names a commander of the wire: no local one has quotes."""
+    return f"'{name}'"
+
+
+def robot_place(report: dict[str, Any]) -> RobotPlace:
+    """Return a bridge's report (`RobotBridge.report`) as a message."""
+    pose, map_id, goal = report["pose"], report["map_id"], report["goal"]
+    text = report["fault"] or report["refusal"] or ""
+    if goal is not None:
+        text = f"to x {goal['x']:.2f} y {goal['y']:.2f} m for {goal['commander']}: {goal['status']}"
+    short = printable(text)[:MAX_ANSWER_LENGTH]
+    if pose is None or map_id is None or max(abs(pose[0]), abs(pose[1])) > MAX_PLACE_M:
+        return RobotPlace(None, None, 0.0, 0.0, 0.0, short)
+    x, y, yaw = pose
+    return RobotPlace(None, map_id, x, y, yaw, short)
