@@ -53,6 +53,7 @@ class TrackedFrame:
     any.
 
     `stamp_ns`: the sensor's stamp, None for `arrival_ns`. `new_segment`: odometry began anew with this frame.
+    `cov`: of the pose, as in `TrackResult`.
     """
 
     arrival_ns: int
@@ -62,6 +63,7 @@ class TrackedFrame:
     stamp_ns: int | None = None
     state: TrackState = TrackState.OK
     new_segment: bool = False
+    cov: F64 | None = None
 
 
 class Simulation:
@@ -90,7 +92,7 @@ class Simulation:
         self.mapper_busy_ns = self.solver_busy_ns = 0
         self.logs = {hello.name: RunLog() for hello, *_ in agents}
         self.localised: dict[str, list[ev.LocalisedPose]] = {hello.name: [] for hello, *_ in agents}
-        self._on_effect, self._on_record = on_effect, on_record
+        self._on_effect, self._on_record, self._config = on_effect, on_record, config
         rng = np.random.default_rng(seed)
         self._delays, self._random_normals = delays, _random_normals(rng)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
@@ -104,18 +106,22 @@ class Simulation:
         for network in dict.fromkeys(network for *_, network in agents):
             if network.air is not None:
                 self.airs[network] = SharedAir(network.air, rng.spawn(1)[0], self._schedule)
-        kept = StoredMap() if store is None else store.load()
-        restored = restored_runs(kept, config.merge.enter_m)
         self._store = store
-        self.edge = Edge(config, session=1, has_store=store is not None, restored=restored)
-        archive = None if store is None else KeyframeArchive(store.path)
-        self.mapper = Mapper(config, archive) if mapper is None else mapper
+        self._start_edge(1, mapper)
+        self._schedule(0, self._tick)
+
+    def _start_edge(self, session: int, mapper: Mapper | None = None) -> None:
+        """Start edge and mapper with what the store keeps, or empty."""
+        kept = StoredMap() if self._store is None else self._store.load()
+        restored = restored_runs(kept, self._config.merge.enter_m)
+        self.edge = Edge(self._config, session, has_store=self._store is not None, restored=restored)
+        archive = None if self._store is None else KeyframeArchive(self._store.path)
+        self.mapper = Mapper(self._config, archive) if mapper is None else mapper
         if kept.runs:
             self.mapper.restore(kept)
         self._solver = PoseGraphSolver()
         self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
         self._is_busy = False  # the mapper process
-        self._schedule(0, self._tick)
 
     def run(self, until_s: float) -> None:
         """Process all events until `until_s`."""
@@ -162,6 +168,7 @@ class Simulation:
             is_keyframe=tracked.candidate is not None,
             new_segment=tracked.new_segment or member.frames_count == 0,
             error_cm=tracked.error_cm,
+            cov=tracked.cov,
         )
         member.frames_count += 1
         self._schedule(done_ns - self.now_ns, lambda: self._to_agent(member, frame))
@@ -256,6 +263,9 @@ class Simulation:
 
     # The mapper process, as in share.runtime.mapper_process.
 
+    def _schedule_mapper(self, delay_ns: int, action: Callable[[], None]) -> None:
+        self._schedule(delay_ns, action)
+
     def _send_to_mapper(self, delay: Delay, action: Callable[[], list[MapEvent]]) -> None:
         self._inbox.append((delay, action))
         if not self._is_busy:
@@ -271,15 +281,15 @@ class Simulation:
             spent_ns += self._draw(delay)
         self.mapper_busy_ns += spent_ns
         self._start_solving(spent_ns)
-        self._schedule(spent_ns, lambda: self._send_findings(findings))
+        self._schedule_mapper(spent_ns, lambda: self._send_findings(findings))
         step = self.mapper.next_lookup()
         if step is None:
-            self._schedule(spent_ns, self._mapper_idle)
+            self._schedule_mapper(spent_ns, self._mapper_idle)
             return
         result = _result_or_error(step.run)
         step_ns = self._draw(self._delay_of(step, result))
         self.mapper_busy_ns += step_ns
-        self._schedule(spent_ns + step_ns, lambda: self._step_done(step, result))
+        self._schedule_mapper(spent_ns + step_ns, lambda: self._step_done(step, result))
 
     def _step_done(self, step: Any, result: object) -> None:
         self._send_findings(self.mapper.finish_step(step, result, 0.0))
@@ -296,7 +306,7 @@ class Simulation:
             apply_result = partial(self.mapper.finish_step, step, result, 0.0)
             solve_ns = self._draw(self._delays.solve)
             self.solver_busy_ns += solve_ns
-            self._schedule(
+            self._schedule_mapper(
                 after_ns + solve_ns, lambda: self._send_to_mapper(self._delays.apply_solution, apply_result)
             )
 
