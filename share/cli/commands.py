@@ -84,6 +84,11 @@ COMMANDS = {
         "robot",
         "Let a ROS 2 robot drive by the shared map, and send it to places.",
     ),
+    "robot simulate": (
+        "share.cli.robot_simulate",
+        "simulate",
+        "Send an emulated robot about in the room of a session.",
+    ),
     "keys": ("share.cli.keys", "keys", "Manage the keys with which other machines connect to an edge."),
 }
 

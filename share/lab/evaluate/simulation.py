@@ -97,11 +97,9 @@ class Simulation:
         self._delays, self._random_normals = delays, _random_normals(rng)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
-        self._members: dict[bytes, _SimulatedAgent] = {}
+        self._members: dict[bytes, SimulatedRun] = {}
         for hello, frames, network in agents:
-            member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
-            self._members[member.peer] = member
-            self._schedule_next_frame(member)
+            self._add_member(hello, frames, network, rng.spawn(2))
         self.airs: dict[NetworkModel, SharedAir] = {}  # of the access points
         for network in dict.fromkeys(network for *_, network in agents):
             if network.air is not None:
@@ -148,11 +146,22 @@ class Simulation:
 
     # Agents.
 
-    def _schedule_next_frame(self, member: _SimulatedAgent) -> None:
+    def _add_member(
+        self,
+        hello: Hello,
+        frames: Iterator[TrackedFrame],
+        network: NetworkModel,
+        rngs: list[np.random.Generator],
+    ) -> None:
+        member = SimulatedRun(hello, Agent(hello, self._config), frames, network, rngs)
+        self._members[member.peer] = member
+        self._schedule_next_frame(member)
+
+    def _schedule_next_frame(self, member: SimulatedRun) -> None:
         if (frame := next(member.incoming, None)) is not None:
             self._schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
 
-    def _frame_arrived(self, member: _SimulatedAgent, tracked: TrackedFrame) -> None:
+    def _frame_arrived(self, member: SimulatedRun, tracked: TrackedFrame) -> None:
         """Schedule the results of a frame, which waits until earlier frames are done, as in the agent's
         tracking thread."""
         begin_ns = max(self.now_ns, member.busy_until_ns)
@@ -179,7 +188,7 @@ class Simulation:
         member.busy_until_ns += self._draw(self._delays.finish_keyframe)
         self._schedule_next_frame(member)
 
-    def _to_agent(self, member: _SimulatedAgent, event: ev.AgentEvent) -> None:
+    def _to_agent(self, member: SimulatedRun, event: ev.AgentEvent) -> None:
         log = self.logs[member.name]
         for effect in member.machine.handle(event, self.now_ns):
             self._on_effect(member.name, effect)
@@ -196,7 +205,7 @@ class Simulation:
                     if effect.stamp_ns is not None and effect.corrected_ms is not None:
                         log.add_correction(effect.stamp_ns, effect.corrected_ms)
 
-    def _send_up(self, member: _SimulatedAgent, frames: Sequence[Bytes]) -> None:
+    def _send_up(self, member: SimulatedRun, frames: Sequence[Bytes]) -> None:
         size = message_bytes(frames)
 
         def on_air_done() -> None:
@@ -207,9 +216,7 @@ class Simulation:
 
         self._over_the_air(member, member.name, size, on_air_done)
 
-    def _over_the_air(
-        self, member: _SimulatedAgent, station: str, size: int, done: Callable[[], None]
-    ) -> None:
+    def _over_the_air(self, member: SimulatedRun, station: str, size: int, done: Callable[[], None]) -> None:
         """Call `done` when a message has passed the shared air of this member, at once without one."""
         if (air := self.airs.get(member.network)) is None:
             done()
@@ -348,9 +355,9 @@ def _result_or_error(action: Callable[[], object]) -> object:
         return error
 
 
-class _SimulatedAgent:
-    """An agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all frames that
-    arrived so far."""
+class SimulatedRun:
+    """A run of an agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all
+    frames that arrived so far."""
 
     def __init__(
         self,

@@ -64,7 +64,8 @@ class GoalGiver:
     ) -> None:
         self.outcomes: list[GoalOutcome] = []
         self.first_goals: list[GoalOutcome] = []  # before the robot shared the map
-        self.T_map_room: PlanarPose | None = None
+        self.T_map_room: PlanarPose | None = None  # by the newest pointing; map_id: None for any
+        self.map_id: str | None = None
         self._loop, self._draw, self._count = loop, draw, count
         self._pointing, self._pointing_alone = pointing, pointing_alone
         self._goal: GoalOutcome | None = None
@@ -82,7 +83,7 @@ class GoalGiver:
         now_s = self._loop.now_ns / 1e9
         pointed = self._pointing()
         if pointed is not None:
-            self.T_map_room = pointed[0]
+            self.T_map_room, self.map_id = pointed
         if self.is_done or now_s < self._next_s:
             return
         if self._is_under_way:

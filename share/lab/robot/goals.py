@@ -27,7 +27,7 @@ class GoalOutcome:
     """One goal. T_world_goal: true place meant. in_map: as it was given, last; map_id: in which map.
 
     text: what the bridge said last; reached: whether the true place is within REACHED_M after the robot said
-    so. error_m, error_rad: true, after the last attempt. seconds: from the first attempt. path_m: truly driven.
+    so. error_m, error_rad: true, after the last attempt. seconds: from the first attempt. path_m: driven.
     attempts: 1 and more, where the map moved and the goal was given again.
     """
 
@@ -81,12 +81,13 @@ def read_goals(path: Path) -> list[PlanarPose]:
         if not words:
             continue
         try:
-            x, y, yaw = (float(word) for word in (*words, "0")[:3])
+            x, y, yaw = (float(word) for word in (*words, "0")[: max(3, len(words))])
+            goal = PlanarPose(x, y, math.radians(yaw))
+            if not goal.is_finite:
+                raise ValueError
         except ValueError:
-            raise UsageError(f"{path}: line {number}: expected X Y [YAW], found '{line.strip()[:60]}'") from None
-        goal = PlanarPose(x, y, math.radians(yaw))
-        if len(words) > 3 or not goal.is_finite:
-            raise UsageError(f"{path}: line {number}: expected X Y [YAW], found '{line.strip()[:60]}'")
+            text = line.strip()[:60]
+            raise UsageError(f"{path}: line {number}: expected X Y [YAW], found '{text}'") from None
         goals.append(goal)
     if not goals:
         raise UsageError(f"{path}: has no goals; write one a line: X Y [YAW]")
@@ -103,9 +104,10 @@ def start_pose(grid: RoomGrid, people: F64, rng: np.random.Generator) -> PlanarP
     if not len(places):
         raise UsageError("the room has no free place for a robot; take a larger room")
     xy = places[int(rng.integers(len(places)))]
+    x, y = xy.tolist()
     yaws = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     yaw = max(yaws.tolist(), key=lambda angle: _free_way_m(grid, xy, angle))
-    return PlanarPose(*xy.tolist(), yaw)
+    return PlanarPose(x, y, yaw)
 
 
 def _free_way_m(grid: RoomGrid, xy: F64, yaw: float) -> float:

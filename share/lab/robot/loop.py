@@ -17,8 +17,9 @@ from share.geometry.se3 import from_rt, inverse, so3_exp
 from share.lab.emulate.types import START_NS
 from share.lab.evaluate.emulated_network import NetworkModel
 from share.lab.evaluate.processing_delays import ProcessingDelays
-from share.lab.evaluate.simulation import Simulation, TrackedFrame
+from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.robot.base import RobotBase, is_person_ahead
+from share.lab.robot.breakable import BreakableRoom
 from share.lab.robot.navigator import CONTROL_S, STOP, CmdVel, Navigator
 from share.lab.robot.planner import Costmap, RoomGrid
 from share.protocol import agent_events as aev
@@ -58,8 +59,14 @@ class RobotAgent(Protocol):
 
     def frame(self, number: int) -> TrackedFrame: ...
 
+    def restart(self, now_ns: int) -> None:
+        """Begin another run, at a session time."""
+        ...
 
-class RobotLoop(Simulation):
+    def show_bare_wall(self, is_shown: bool) -> None: ...
+
+
+class RobotLoop(BreakableRoom):
     """The robot, its navigation, its bridge, and the room's agents and edge.
 
     agent: the robot's; None where `own_pose` says where it is instead: a function of the base's present step,
@@ -91,13 +98,11 @@ class RobotLoop(Simulation):
         self.on_report: Callable[[ev.GoalReport], None] = lambda report: None
         self.on_trace: Callable[[], None] = lambda: None
         self._grid, self._people_at, self._settings = grid, people_at, settings
-        self._network, self._own_pose, self._agent = network, own_pose, agent
+        self._own_pose, self._agent, self._seed = own_pose, agent, seed
         self._T_base_body = inverse(settings.T_body_base)
         self._messages = PoseMessages(ROBOT)
         self._statuses: tuple[tuple[bytes, ev.GoalStatus], ...] = ()
         self._control_count = 0
-        self._outage_until_ns = 0
-        self._edge_epoch, self._is_edge_up, self._is_agent_up = 0, True, True
         self.bridge: RobotBridge | None = None
         self.start_bridge()
         for action in (self._send_odometry, self._control, self._bridge_tick, self._look, self._write_trace):
@@ -164,9 +169,27 @@ class RobotLoop(Simulation):
         self.base.advance(self.now_ns)
         if self._own_pose is not None:
             self._send_own_pose(self._own_pose(self.now_ns))
-        elif self._agent is not None and self._is_agent_up:
-            member = next(one for one in self._members.values() if one.name == ROBOT)
-            self._frame_arrived(member, self._agent.frame(number))
+        elif self._agent is not None and self.has_run(ROBOT):
+            self._frame_arrived(self.run_of(ROBOT), self._agent.frame(number))
+
+    def kill_robot_agent(self) -> None:
+        if self._agent is not None:
+            self.kill_agent(ROBOT)
+
+    def start_robot_agent(self) -> None:
+        if self._agent is not None:
+            self._agent.restart(self.now_ns)
+            self._messages = PoseMessages(ROBOT)
+            self.start_agent(self._agent.hello, self._seed)
+
+    def show_bare_wall(self, is_shown: bool) -> None:
+        """Let the robot's cameras see nothing but a bare wall, or the room again."""
+        if self._agent is not None:
+            self._agent.show_bare_wall(is_shown)
+
+    def after(self, delay_ns: int, action: Callable[[], None]) -> None:
+        """Call `action` after a delay."""
+        self._schedule(delay_ns, action)
 
     def _send_own_pose(self, T_map_base: PlanarPose) -> None:
         T_map_body = solid_pose(T_map_base) @ self._T_base_body
@@ -189,15 +212,13 @@ class RobotLoop(Simulation):
                 self._send_message(self._messages.of_state(effect.stamp_ns, effect.state))
             case aev.StatusReport() if effect.is_stale and effect.stamp_ns is not None:
                 status = effect.status
-                self._send_message(
-                    self._messages.of_state(effect.stamp_ns, status.state, status.pose_age_ms)
-                )
+                self._send_message(self._messages.of_state(effect.stamp_ns, status.state, status.pose_age_ms))
             case aev.PrintLine():
                 self.lines.append((self.now_ns / 1e9, f"agent: {effect.text}"))
 
     @property
     def _hears_edge(self) -> bool:
-        return any(one.machine.is_connected for one in self._members.values() if one.name == ROBOT)
+        return self.has_run(ROBOT) and self.run_of(ROBOT).machine.is_connected
 
     def _send_message(self, text: str) -> None:
         pose = parse_pose_message(text.encode())
@@ -213,7 +234,11 @@ class RobotLoop(Simulation):
         self._schedule(_DDS_NS, lambda: self.to_bridge(ev.StatusReceived(self._statuses)))
 
     def kill_bridge(self) -> None:
+        """End the bridge at once, and with it the commands that wait for it."""
+        goal = None if self.bridge is None else self.bridge.report(self.now_ns)["goal"]
         self.bridge = None
+        if goal is not None:
+            self.on_report(ev.GoalReport(goal["commander"], "the bridge has ended", is_final=True))
 
     def _bridge_tick(self) -> None:
         self.to_bridge(ev.BridgeTick())
@@ -239,13 +264,12 @@ class RobotLoop(Simulation):
                 cancelled = effect.goal_id
                 self._schedule(_DDS_NS, lambda: navigator.cancel(cancelled))
             case ev.AskResult():
-                self._schedule(
-                    2 * _DDS_NS, lambda: self.to_bridge(ev.ResultReceived(navigator.abort_code))
-                )
+                self._schedule(2 * _DDS_NS, lambda: self.to_bridge(ev.ResultReceived(navigator.abort_code)))
             case ev.LimitSpeed():
                 navigator.limit_speed(effect.speed_m_s)
             case ev.GoalReport():
-                self.lines.append((self.now_ns / 1e9, f"{effect.commander}: {effect.text}"))
+                if not effect.text.endswith("to go"):
+                    self.lines.append((self.now_ns / 1e9, f"{effect.commander}: {effect.text}"))
                 self.on_report(effect)
             case ev.BridgeLine():
                 self.lines.append((self.now_ns / 1e9, effect.text))

@@ -1,4 +1,4 @@
-"""Paths over a robot's costmap: the cheapest way to a goal that keeps off obstacles, as Nav2's NavFn finds it.
+"""Paths over a robot's costmap: the cheapest way to a goal that keeps off obstacles, as Nav2's NavFn does.
 
 The costmap is fixed to the room; where it lies in the map is what the robot believes.
 """
@@ -102,4 +102,5 @@ def _distances(places: F64, xy: F64) -> F64:
 
 def _in_map(T: PlanarPose, points: F64) -> F64:
     c, s = np.cos(T.yaw), np.sin(T.yaw)
-    return points @ np.array([[c, s], [-s, c]]) + (T.x, T.y)
+    out: F64 = points @ np.array([[c, s], [-s, c]]) + (T.x, T.y)
+    return out

@@ -41,7 +41,9 @@ class EmulatedRoom:
 
     def people_at(self, session_ns: int) -> F64:
         """Return where the people's heads are (P, 2), m, at a session time."""
-        at = [person.path.poses(_own_times(person, np.array([session_ns])))[0, :2, 3] for person in self.people]
+        at = [
+            person.path.poses(_own_times(person, np.array([session_ns])))[0, :2, 3] for person in self.people
+        ]
         return np.array(at, np.float64).reshape(-1, 2)
 
 
@@ -68,7 +70,9 @@ def _recipe(session: Session) -> SessionRecipe:
         raise UsageError(
             f"{session.folder}: its room is not known; give a session that `share emulate` has made"
         )
-    fields = {key: made[key] for key in ("scene", "motions", "seconds", "seed", "sensors", "profiles", "images")}
+    fields = {
+        key: made[key] for key in ("scene", "motions", "seconds", "seed", "sensors", "profiles", "images")
+    }
     size = made.get("size")
     return SessionRecipe(
         **fields | {"motions": tuple(fields["motions"])},

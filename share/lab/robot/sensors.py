@@ -6,7 +6,7 @@ The device and its errors are the emulator's. The exposure of a frame follows th
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -55,6 +55,10 @@ class RobotSensors:
         """Session times of all frames."""
         times: list[int] = (self._pictures.true_ns - START_NS).tolist()
         return times
+
+    def restart(self, now_ns: int) -> None:
+        """Forget what was measured before a session time."""
+        self._imu_until_ns = now_ns + START_NS
 
     def frame(self, number: int) -> Frame:
         """Return frame `number` of `frame_times_ns`; each in turn, once its path is known."""
@@ -114,6 +118,6 @@ class RobotSensors:
         return new
 
 
-def _columns(rows: object) -> tuple[I64, F64]:
-    times, values = zip(*rows, strict=True)  # type: ignore[call-overload]
+def _columns(rows: Iterable[tuple[int, float]]) -> tuple[I64, F64]:
+    times, values = zip(*rows, strict=True)
     return np.array(times, np.int64), np.array(values, np.float64)

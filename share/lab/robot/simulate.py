@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.evaluate.virtual_time import track_agent, tracked_frame
 from share.lab.robot.base import RobotBase
 from share.lab.robot.drive import DriveModel
+from share.lab.robot.faults import LoopFault, schedule_faults
 from share.lab.robot.giver import GoalGiver, HeadsetPointing, points_in_room
 from share.lab.robot.goals import GoalOutcome, drawn_goals, start_pose
 from share.lab.robot.loop import ROBOT, Member, RobotLoop
@@ -27,6 +29,7 @@ from share.lab.robot.sensors import RobotSensors
 from share.odometry.error_model.network import open_error_model
 from share.recordings.session import Session
 from share.robot.planar import PlanarPose
+from share.robot.robot_file import T_base_of_camera
 from share.robot.settings import RobotSettings
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate, SynchronousErrorModel
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
@@ -42,6 +45,7 @@ LINK = "wifi5"
 _ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
 _FRAME_HZ = 15.0  # of a robot that is told where it is
 _STEP_S = 0.5
+_CAMERA_M = (0.09, 0.018, 0.21)
 
 Show = Callable[[str, float], None]  # what goes on, session time s
 
@@ -58,6 +62,13 @@ class LoopOptions:
     seed: int = 0
     seconds: float = 300.0
     profile: str = "d435i:640x480@15"
+    faults: tuple[LoopFault, ...] = ()
+
+
+def usual_robot() -> RobotSettings:
+    """Return the robot of the docs' example, a little faster, without an area."""
+    T_base_body = T_base_of_camera(_CAMERA_M)
+    return RobotSettings(inverse(T_base_body), allow_goals=True, max_speed_m_s=0.3)
 
 
 class EmulatedRobotAgent:
@@ -67,9 +78,10 @@ class EmulatedRobotAgent:
         self, sensors: RobotSensors, settings: Config, run_id: int, notify: Callable[[str], None]
     ) -> None:
         self.hello = Hello(ROBOT, AgentKind.ROBOT, run_id, sensors.rig)
-        self.sensors = sensors
         self.frame_times_ns: Sequence[int] = sensors.frame_times_ns
-        self._tracker = GuardedTracker(sensors.rig, settings, FaultGuard(notify))
+        self._sensors = sensors
+        self._make_tracker = partial(GuardedTracker, sensors.rig, settings, FaultGuard(notify))
+        self._tracker = self._make_tracker()
         model = settings.agent.error_model
         self._errors: ErrorEstimator = (
             SynchronousErrorModel(open_error_model(model)) if model else NoErrorEstimate()
@@ -77,8 +89,17 @@ class EmulatedRobotAgent:
 
     def frame(self, number: int) -> TrackedFrame:
         """Draw frame `number` and track it."""
-        [step] = track_frames(iter([self.sensors.frame(number)]), self._tracker, self._errors)
+        [step] = track_frames(iter([self._sensors.frame(number)]), self._tracker, self._errors)
         return tracked_frame(step, START_NS)
+
+    def restart(self, now_ns: int) -> None:
+        """Begin another run, at a session time."""
+        self.hello = replace(self.hello, run_id=self.hello.run_id + 1)
+        self._tracker = self._make_tracker()
+        self._sensors.restart(now_ns)
+
+    def show_bare_wall(self, is_shown: bool) -> None:
+        self._sensors.sees_bare_wall = is_shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +125,7 @@ def simulate(
 ) -> LoopRun:
     """Send a robot about in a session's room. Deterministic for given options. Raises UsageError."""
     loop, giver = prepare_loop(session, room, options, config, robot, show)
+    schedule_faults(loop, options.faults)
     now_s = 0.0
     while now_s < options.seconds and not giver.is_done:
         now_s += _STEP_S

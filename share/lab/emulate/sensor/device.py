@@ -192,9 +192,7 @@ class EmulatedDevice:
 
     def _with_errors(self, perfect: F64, sensor: InertialFacts, sensor_index: int, limits: bool) -> F64:
         seed = (*self._seed, _GYRO_STREAM, sensor_index)
-        return measured_samples(
-            perfect, sensor, seed, self.effects.imu_noise, self.effects.imu_bias, limits
-        )
+        return measured_samples(perfect, sensor, seed, self.effects.imu_noise, self.effects.imu_bias, limits)
 
     def _vibration(self, times_ns: I64, sensor_index: int) -> F64:
         """Return what vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
