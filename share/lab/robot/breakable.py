@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from share.lab.evaluate.emulated_network import NetworkModel
 from share.lab.evaluate.simulation import SimulatedRun, Simulation
 from share.protocol import agent_events as aev
 from share.protocol import edge_events as ed
@@ -57,9 +58,8 @@ class BreakableRoom(Simulation):
         """End the newest run of an agent at once."""
         del self._members[self.run_of(name).peer]
 
-    def start_agent(self, hello: Hello, seed: int) -> None:
+    def start_agent(self, hello: Hello, network: NetworkModel, seed: int) -> None:
         """Start another run of an agent, whose frames are pushed."""
-        network = next(iter(self._members.values())).network
         self._add_member(hello, iter(()), network, np.random.default_rng((seed, hello.run_id)).spawn(2))
         self._schedule(_RECONNECT_NS, lambda: self._to_agent(self.run_of(hello.name), aev.Connected()))
 

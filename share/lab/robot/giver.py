@@ -51,8 +51,8 @@ class HeadsetPointing:
 
 
 class GoalGiver:
-    """Gives goals until `count` are done. draw: returns the next one in the room, from where the robot is;
-    pointing, pointing_alone: by the wearer, and by the robot itself until they share a map."""
+    """Gives `count` goals, one after the other's end. draw: returns the next one in the room, from where the
+    robot is; pointing: by the wearer. Until they share a map: draw_first, pointing_first."""
 
     def __init__(
         self,
@@ -60,14 +60,15 @@ class GoalGiver:
         draw: Callable[[PlanarPose], PlanarPose],
         count: int,
         pointing: Pointing,
-        pointing_alone: Pointing | None = None,
+        draw_first: Callable[[PlanarPose], PlanarPose] | None = None,
+        pointing_first: Pointing | None = None,
     ) -> None:
         self.outcomes: list[GoalOutcome] = []
         self.first_goals: list[GoalOutcome] = []  # before the robot shared the map
         self.T_map_room: PlanarPose | None = None  # by the newest pointing; map_id: None for any
         self.map_id: str | None = None
         self._loop, self._draw, self._count = loop, draw, count
-        self._pointing, self._pointing_alone = pointing, pointing_alone
+        self._pointing, self._draw_first, self._pointing_first = pointing, draw_first, pointing_first
         self._goal: GoalOutcome | None = None
         self._is_under_way = False
         self._next_s, self._begun_ns = 0.0, 0
@@ -110,16 +111,16 @@ class GoalGiver:
         self._goal = None
 
     def _give(self, pointed: tuple[PlanarPose, str | None] | None, now_s: float) -> None:
-        is_first = pointed is None
-        if pointed is None and self._pointing_alone is not None:
-            pointed = self._pointing_alone()
+        is_first, draw = pointed is None, self._draw
+        if pointed is None and self._pointing_first is not None and self._draw_first is not None:
+            pointed, draw = self._pointing_first(), self._draw_first
         if pointed is None:
             return
         here = self._loop.base.at(self._loop.now_ns).T_world_base
         if self._goal is not None and is_first != (self._goal in self.first_goals):
             self._finish(self._goal, now_s)  # of the robot's own map
         if self._goal is None:
-            self._goal = GoalOutcome(self._draw(here), begun_s=now_s)
+            self._goal = GoalOutcome(draw(here), begun_s=now_s)
             (self.first_goals if is_first else self.outcomes).append(self._goal)
             self._begun_ns = self._loop.now_ns
         T_map_room, map_id = pointed

@@ -98,7 +98,7 @@ class RobotLoop(BreakableRoom):
         self.on_report: Callable[[ev.GoalReport], None] = lambda report: None
         self.on_trace: Callable[[], None] = lambda: None
         self._grid, self._people_at, self._settings = grid, people_at, settings
-        self._own_pose, self._agent, self._seed = own_pose, agent, seed
+        self._own_pose, self._agent, self._network, self._seed = own_pose, agent, network, seed
         self._T_base_body = inverse(settings.T_body_base)
         self._messages = PoseMessages(ROBOT)
         self._statuses: tuple[tuple[bytes, ev.GoalStatus], ...] = ()
@@ -180,7 +180,7 @@ class RobotLoop(BreakableRoom):
         if self._agent is not None:
             self._agent.restart(self.now_ns)
             self._messages = PoseMessages(ROBOT)
-            self.start_agent(self._agent.hello, self._seed)
+            self.start_agent(self._agent.hello, self._network, self._seed)
 
     def show_bare_wall(self, is_shown: bool) -> None:
         """Let the robot's cameras see nothing but a bare wall, or the room again."""

@@ -106,6 +106,10 @@ class Navigator:
             return None
         return (self._T_map_odom @ self._T_odom_base).distance_m(self._task[1])
 
+    def has_place(self, now_ns: int) -> bool:
+        """Whether `map → odom` is there and valid at a time."""
+        return self._place(now_ns) is not None
+
     def tick(self, now_ns: int) -> CmdVel | None:
         """Return the command at a time; None where nothing is to be commanded."""
         if self._task is None:

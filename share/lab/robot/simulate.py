@@ -169,7 +169,8 @@ def prepare_loop(
     def wearer_pose(now_ns: int) -> Any:
         return wearer.path.poses(np.array([now_ns + wearer.path.start_ns]))[0]
 
-    return loop, GoalGiver(loop, draw, count, HeadsetPointing(loop, wearer.name, wearer_pose), alone)
+    pointing = HeadsetPointing(loop, wearer.name, wearer_pose)
+    return loop, GoalGiver(loop, draw, count, pointing, drawn_goals(room.grid, rngs[3]), alone)
 
 
 def _at(session_ns: int) -> Any:
