@@ -137,7 +137,6 @@ class GoalGiver:
     def _take_report(self, report: ev.GoalReport) -> None:
         if report.commander != GIVER or self._goal is None:
             return
-        self._goal.lines.append(f"{self._loop.now_ns / 1e9:.1f} s: {report.text}")
         if report.is_final:
             self._goal.text, self._goal.says_reached = report.text, report.is_reached
             self._is_under_way = False

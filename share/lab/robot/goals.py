@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +42,16 @@ class GoalOutcome:
     seconds: float = math.nan
     path_m: float = 0.0
     attempts: int = 0
-    lines: list[str] = field(default_factory=list)
 
     @property
     def is_reached(self) -> bool:
         """Whether the robot is where it was sent, by the truth."""
         return self.says_reached and self.error_m <= REACHED_M
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the end was measured; not so for a goal under way when the run ended."""
+        return math.isfinite(self.error_m)
 
     def finish(self, T_world_base: PlanarPose, now_s: float) -> None:
         """Measure the end."""
@@ -57,15 +61,19 @@ class GoalOutcome:
 
 
 def drawn_goals(grid: RoomGrid, rng: np.random.Generator) -> Callable[[PlanarPose], PlanarPose]:
-    """Return what draws the next goal from where the robot is: 2 to 6 m of way from there, off obstacles."""
+    """Return what draws the next goal from where the robot is: 2 to 6 m of way from there, off obstacles.
+
+    The first that fits of a random order: robots that end a little apart mostly get the same.
+    """
 
     def draw(T_world_base: PlanarPose) -> PlanarPose:
         lengths = grid.lengths_from(np.array([T_world_base.x, T_world_base.y]))
         clear = grid.floor.clearance_at(grid.places) >= _GOAL_CLEARANCE_M
-        places = grid.places[clear & (lengths >= _WAY_M[0]) & (lengths <= _WAY_M[1])]
-        if not len(places):
+        order = rng.permutation(len(grid.places))
+        fits = (clear & (lengths >= _WAY_M[0]) & (lengths <= _WAY_M[1]))[order]
+        if not fits.any():
             raise UsageError("the room has no free place 2 to 6 m from the robot; take a larger room")
-        x, y = places[int(rng.integers(len(places)))].tolist()
+        x, y = grid.places[order[int(np.argmax(fits))]].tolist()
         return PlanarPose(x, y, float(rng.uniform(-math.pi, math.pi)))
 
     return draw
@@ -116,6 +124,6 @@ def _free_way_m(grid: RoomGrid, xy: F64, yaw: float) -> float:
     return float(np.argmin(ahead)) if not ahead.all() else float(len(ahead))
 
 
-def counted(outcomes: Sequence[GoalOutcome]) -> int:
-    """Return how many goals were reached by the truth."""
-    return sum(one.is_reached for one in outcomes)
+def reached_text(outcomes: Sequence[GoalOutcome]) -> str:
+    """Return how many goals of those that came to an end were reached by the truth."""
+    return f"{sum(one.is_reached for one in outcomes)} of {sum(one.has_ended for one in outcomes)}"

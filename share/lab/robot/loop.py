@@ -69,8 +69,9 @@ class RobotAgent(Protocol):
 class RobotLoop(BreakableRoom):
     """The robot, its navigation, its bridge, and the room's agents and edge.
 
-    agent: the robot's; None where `own_pose` says where it is instead: a function of the base's present step,
-    T_map_base. on_report, on_pose: called with what a commander is told and with each agent's pose.
+    agent: the robot's; None where `own_pose` says where it is instead, T_map_base at each of frame_times_ns.
+    on_report, on_trace: called with what a commander is told, and ten times a second.
+    trace: time s, true place, place by the map or None, map. lines: time s, text. newest_poses: of all agents.
     """
 
     def __init__(
@@ -109,6 +110,10 @@ class RobotLoop(BreakableRoom):
             self._schedule(0, action)
         for number, time_ns in enumerate(agent.frame_times_ns if agent else frame_times_ns):
             self._schedule(time_ns, lambda number=number: self._take_frame(number))  # type: ignore[misc]
+
+    def note(self, text: str) -> None:
+        """Keep a line, with its time."""
+        self.lines.append((self.now_ns / 1e9, text))
 
     # ------------------------------------------------------------ the robot
 
@@ -214,7 +219,7 @@ class RobotLoop(BreakableRoom):
                 status = effect.status
                 self._send_message(self._messages.of_state(effect.stamp_ns, status.state, status.pose_age_ms))
             case aev.PrintLine():
-                self.lines.append((self.now_ns / 1e9, f"agent: {effect.text}"))
+                self.note(f"agent: {effect.text}")
 
     @property
     def _hears_edge(self) -> bool:
@@ -269,10 +274,10 @@ class RobotLoop(BreakableRoom):
                 navigator.limit_speed(effect.speed_m_s)
             case ev.GoalReport():
                 if not effect.text.endswith("to go"):
-                    self.lines.append((self.now_ns / 1e9, f"{effect.commander}: {effect.text}"))
+                    self.note(f"{effect.commander}: {effect.text}")
                 self.on_report(effect)
             case ev.BridgeLine():
-                self.lines.append((self.now_ns / 1e9, effect.text))
+                self.note(effect.text)
 
     @property
     def place(self) -> tuple[PlanarPose | None, str | None]:

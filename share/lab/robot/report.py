@@ -14,7 +14,7 @@ from share import __version__
 from share.lab.emulate.recordings import draw_room
 from share.lab.evaluate.charts import agg_pyplot, save_png
 from share.lab.evaluate.provenance import code_digest
-from share.lab.robot.goals import REACHED_M, GoalOutcome, counted
+from share.lab.robot.goals import REACHED_M, GoalOutcome, reached_text
 from share.lab.robot.room import EmulatedRoom
 from share.lab.robot.simulate import LoopRun
 from share.plain_data import to_mapping
@@ -42,7 +42,8 @@ def run_report(run: LoopRun, session: str) -> dict[str, Any]:
         "faults": [to_mapping(fault) for fault in options.faults],
         "seconds": round(loop.now_ns / 1e9, 3),
         "reached_m": REACHED_M,
-        "reached": counted(outcomes),
+        "reached": sum(one.is_reached for one in outcomes),
+        "ended": sum(one.has_ended for one in outcomes),
         "goals": [_goal(outcome) for outcome in outcomes],
         "first_goals": [_goal(outcome) for outcome in run.giver.first_goals],
         "place_error_m": None if not errors else round(median(errors), _DIGITS),
@@ -100,8 +101,8 @@ def outcome_rows(outcomes: Sequence[GoalOutcome]) -> list[list[str]]:
             f"{one.seconds:.1f}",
             f"{one.path_m:.1f}",
         ]
-        known = figures if math.isfinite(one.error_m) else ["–"] * len(figures)
-        reached = "yes" if one.is_reached else "no"
+        known = figures if one.has_ended else ["–"] * len(figures)
+        reached = "yes" if one.is_reached else "no" if one.has_ended else "–"
         where = [f"{one.T_world_goal.x:.2f}", f"{one.T_world_goal.y:.2f}"]
         rows.append([str(number), *where, reached, *known, str(one.attempts), one.text[:60]])
     return rows
@@ -114,7 +115,7 @@ def summary_text(report: dict[str, Any]) -> str:
         return "no goal has come to its end"
     errors, seconds = ([goal[key] for goal in goals] for key in ("error_m", "seconds"))
     return (
-        f"{report['reached']} of {len(report['goals'])} goals reached within {report['reached_m']:g} m "
+        f"{report['reached']} of {len(goals)} goals reached within {report['reached_m']:g} m "
         f"by the truth; final error {median(errors):.2f} m (median), {max(errors):.2f} m at most; "
         f"{median(seconds):.1f} s each (median)"
     )
@@ -141,8 +142,8 @@ def draw_run(path: Path, room: EmulatedRoom, run: LoopRun) -> None:
         stamps = np.arange(person.path.start_ns, person.path.end_ns, 100_000_000)
         p = person.path.poses(stamps)[:, :2, 3]
         axes.plot(*p.T, color="#999999", linewidth=0.8, label=person.name)
-    title = f"{run.options.localisation}, seed {run.options.seed}: {counted(run.outcomes)} of "
-    axes.set_title(f"{title}{len(run.outcomes)} goals reached (circles: {REACHED_M:g} m)")
+    title = f"{run.options.localisation}, seed {run.options.seed}: {reached_text(run.outcomes)} goals reached"
+    axes.set_title(f"{title} (circles: {REACHED_M:g} m)")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=6, frameon=False)
     save_png(figure, path, 100)
 

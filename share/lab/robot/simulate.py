@@ -157,9 +157,8 @@ def prepare_loop(
         loop = RobotLoop(config, [], *common, None, network, own_pose, times)
         return loop, GoalGiver(loop, draw, count, points_in_room)
     members = _people(session, room, config, show)
-    lines: list[str] = []
     sensors = _robot_sensors(room, base, options)
-    agent = EmulatedRobotAgent(sensors, config, _ROBOT_RUN, lines.append)
+    agent = EmulatedRobotAgent(sensors, config, _ROBOT_RUN, lambda text: loop.note(f"agent: {text}"))
     loop = RobotLoop(config, members, *common, agent, network)
     alone = HeadsetPointing(loop, ROBOT, lambda now_ns: base.body.part(now_ns, now_ns).poses(_at(now_ns))[0])
     if not room.people:
