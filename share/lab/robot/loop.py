@@ -71,7 +71,8 @@ class RobotLoop(BreakableRoom):
 
     agent: the robot's; None where `own_pose` says where it is instead, T_map_base at each of frame_times_ns.
     on_report, on_trace: called with what a commander is told, and ten times a second.
-    trace: time s, true place, place by the map or None, map. lines: time s, text. newest_poses: of all agents.
+    trace: time s, true place, place by the map or None, map. lines: time s, text. newest_poses: of each
+    agent.
     """
 
     def __init__(

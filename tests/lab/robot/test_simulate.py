@@ -87,9 +87,8 @@ def test_bad_options_are_refused_in_a_line(tmp_path: Path, more: tuple[str, ...]
 def test_a_session_from_elsewhere_is_refused(tmp_path: Path) -> None:
     session = tmp_path / "field"
     session.mkdir()
-    (session / "session.yaml").write_text(
-        "schema: 1\nagents: {ann: {kind: ar, sensors: stereo, rate_hz: 30}}\n"
-    )
+    agents = "{ann: {kind: ar, sensors: stereo, rate_hz: 30, clock_offset_ns: 0}}"
+    (session / "session.yaml").write_text(f"schema: 1\nprovenance: {{}}\nagents: {agents}\n")
     result = simulate(session, tmp_path / "drive")
-    assert result.exit_code != 0
+    assert result.exit_code != 0 and "its room is not known" in f"{result.output}{result.exception}"
     assert not (tmp_path / "drive").exists()
