@@ -85,6 +85,11 @@ COMMANDS = {
         "robot",
         "Let a ROS 2 robot drive by the shared map, and send it to places.",
     ),
+    "robot simulate": (
+        "share.cli.robot_simulate",
+        "simulate",
+        "Send an emulated robot about in the room of a session.",
+    ),
     "marker": ("share.cli.marker", "marker", "Place, list and remove objects of the shared room."),
     "keys": ("share.cli.keys", "keys", "Manage the keys with which other machines connect to an edge."),
 }

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import radians
 from pathlib import Path
@@ -64,9 +65,17 @@ def _T_base_body(form: Section) -> F64:
         raise ConfigError(
             f"{camera.where}: unknown key '{unknown[0]}'; known: position_m, yaw_deg, pitch_deg"
         )
-    yaw, pitch = radians(camera.number("yaw_deg", 0.0)), radians(camera.number("pitch_deg", 0.0))
+    return T_base_of_camera(
+        camera.numbers("position_m", (3,)), camera.number("yaw_deg", 0.0), camera.number("pitch_deg", 0.0)
+    )
+
+
+def T_base_of_camera(position_m: Sequence[float], yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> F64:
+    """Return T_base_body (4, 4) of a camera at a position in base_link (3,), its view turned to the left and
+    down."""
+    yaw, pitch = radians(yaw_deg), radians(pitch_deg)
     R = so3_exp(np.array([0.0, 0.0, yaw])) @ so3_exp(np.array([0.0, pitch, 0.0])) @ _R_BASE_CAMERA
-    return from_rt(R, np.array(camera.numbers("position_m", (3,))))
+    return from_rt(R, np.array(position_m, float))
 
 
 def _area(form: Section) -> DrivingArea:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -149,16 +150,10 @@ _ARROW_S = 5.0  # between two arrows that show an agent's viewing direction
 
 def draw_plan(path: Path, layout: Layout, actors: tuple[Actor, ...]) -> None:
     """Write a PNG: furniture by its height (darker is higher), paths, and an arrow every few seconds."""
-    from matplotlib.collections import PolyCollection
-
     pyplot = agg_pyplot()
     length, width, height = layout.size
     figure, axes = pyplot.subplots(figsize=(10, 10 * (width + 1.2) / (length + 1)), layout="constrained")
-    triangles = _furniture_triangles(layout)
-    tops = triangles[:, :, 2].mean(axis=1)
-    shades = 0.93 - 0.6 * (tops / height).clip(0, 1)
-    axes.add_collection(PolyCollection(list(triangles[:, :, :2]), facecolors=[str(s) for s in shades]))
-    axes.add_patch(pyplot.Rectangle((0, 0), length, width, fill=False, linewidth=2))
+    draw_room(axes, layout)
     for actor, colour in zip(actors, agent_colours(actor.name for actor in actors).values(), strict=True):
         p, ahead = _camera_path(actor)
         walked_m = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()
@@ -175,12 +170,25 @@ def draw_plan(path: Path, layout: Layout, actors: tuple[Actor, ...]) -> None:
             scale=1,
             width=3e-3,
         )
-    axes.set(
-        xlim=(-0.3, length + 0.3), ylim=(-0.3, width + 0.3), xlabel="x [m]", ylabel="y [m]", aspect="equal"
-    )
     axes.set_title(f"{layout.name}, seed {layout.seed}, {length:g} x {width:g} x {height:g} m")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=6, frameon=False)
     save_png(figure, path, 100)
+
+
+def draw_room(axes: Any, layout: Layout) -> None:
+    """Draw a room from above."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import Rectangle
+
+    length, width, height = layout.size
+    triangles = _furniture_triangles(layout)
+    tops = triangles[:, :, 2].mean(axis=1)
+    shades = 0.93 - 0.6 * (tops / height).clip(0, 1)
+    axes.add_collection(PolyCollection(list(triangles[:, :, :2]), facecolors=[str(s) for s in shades]))
+    axes.add_patch(Rectangle((0, 0), length, width, fill=False, linewidth=2))
+    axes.set(
+        xlim=(-0.3, length + 0.3), ylim=(-0.3, width + 0.3), xlabel="x [m]", ylabel="y [m]", aspect="equal"
+    )
 
 
 def _furniture_triangles(layout: Layout) -> F64:

@@ -94,9 +94,7 @@ class RoomStage:
             actor.path.poses(np.clip(times, actor.path.start_ns, actor.path.end_ns))
             for times in (true_ns - half, true_ns + half)
         )
-        turned = se3.rotation_angle(np.swapaxes(first[:, :3, :3], 1, 2) @ last[:, :3, :3])
-        moved: F64 = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
-        return actor.rig.cam0.focal * (turned + moved / _BLUR_DISTANCE_M)
+        return image_motion_px(actor.rig, first, last)
 
     def _other_parts(self, actor_index: int, session_ns: I64) -> dict[str, F64]:
         """Return parts (N, P, 4, 4) of all other agents; they stand still before and after their paths."""
@@ -108,6 +106,13 @@ class RoomStage:
                     np.clip(own_ns, actor.path.start_ns, actor.path.end_ns)
                 )
         return out
+
+
+def image_motion_px(rig: Rig, first: F64, last: F64) -> F64:
+    """Return the image motion (N,) px of things at _BLUR_DISTANCE_M between poses (N, 4, 4) of the body."""
+    turned = se3.rotation_angle(np.swapaxes(first[:, :3, :3], 1, 2) @ last[:, :3, :3])
+    moved: F64 = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
+    return rig.cam0.focal * (turned + moved / _BLUR_DISTANCE_M)
 
 
 def in_gaps(gaps: I64, true_ns: I64) -> NDArray[np.bool_]:

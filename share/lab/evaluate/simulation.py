@@ -53,6 +53,7 @@ class TrackedFrame:
     any.
 
     `stamp_ns`: the sensor's stamp, None for `arrival_ns`. `new_segment`: odometry began anew with this frame.
+    `cov`: of the pose, as in `TrackResult`.
     """
 
     arrival_ns: int
@@ -62,6 +63,7 @@ class TrackedFrame:
     stamp_ns: int | None = None
     state: TrackState = TrackState.OK
     new_segment: bool = False
+    cov: F64 | None = None
 
 
 class Simulation:
@@ -90,32 +92,34 @@ class Simulation:
         self.mapper_busy_ns = self.solver_busy_ns = 0
         self.logs = {hello.name: RunLog() for hello, *_ in agents}
         self.localised: dict[str, list[ev.LocalisedPose]] = {hello.name: [] for hello, *_ in agents}
-        self._on_effect, self._on_record = on_effect, on_record
+        self._on_effect, self._on_record, self._config = on_effect, on_record, config
         rng = np.random.default_rng(seed)
         self._delays, self._random_normals = delays, _random_normals(rng)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
-        self._members: dict[bytes, _SimulatedAgent] = {}
+        self._members: dict[bytes, SimulatedRun] = {}
         for hello, frames, network in agents:
-            member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
-            self._members[member.peer] = member
-            self._schedule_next_frame(member)
+            self._add_member(hello, frames, network, rng.spawn(2))
         self.airs: dict[NetworkModel, SharedAir] = {}  # of the access points
         for network in dict.fromkeys(network for *_, network in agents):
             if network.air is not None:
                 self.airs[network] = SharedAir(network.air, rng.spawn(1)[0], self._schedule)
-        kept = StoredMap() if store is None else store.load()
-        restored = restored_runs(kept, config.merge.enter_m)
         self._store = store
-        self.edge = Edge(config, session=1, has_store=store is not None, restored=restored)
-        archive = None if store is None else KeyframeArchive(store.path)
-        self.mapper = Mapper(config, archive) if mapper is None else mapper
+        self._start_edge(1, mapper)
+        self._schedule(0, self._tick)
+
+    def _start_edge(self, session: int, mapper: Mapper | None = None) -> None:
+        """Start edge and mapper with what the store keeps, or empty."""
+        kept = StoredMap() if self._store is None else self._store.load()
+        restored = restored_runs(kept, self._config.merge.enter_m)
+        self.edge = Edge(self._config, session, has_store=self._store is not None, restored=restored)
+        archive = None if self._store is None else KeyframeArchive(self._store.path)
+        self.mapper = Mapper(self._config, archive) if mapper is None else mapper
         if kept.runs:
             self.mapper.restore(kept)
         self._solver = PoseGraphSolver()
         self._inbox: deque[tuple[Delay, Callable[[], list[MapEvent]]]] = deque()  # of the mapper process
         self._is_busy = False  # the mapper process
-        self._schedule(0, self._tick)
 
     def run(self, until_s: float) -> None:
         """Process all events until `until_s`."""
@@ -142,11 +146,22 @@ class Simulation:
 
     # Agents.
 
-    def _schedule_next_frame(self, member: _SimulatedAgent) -> None:
+    def _add_member(
+        self,
+        hello: Hello,
+        frames: Iterator[TrackedFrame],
+        network: NetworkModel,
+        rngs: list[np.random.Generator],
+    ) -> None:
+        member = SimulatedRun(hello, Agent(hello, self._config), frames, network, rngs)
+        self._members[member.peer] = member
+        self._schedule_next_frame(member)
+
+    def _schedule_next_frame(self, member: SimulatedRun) -> None:
         if (frame := next(member.incoming, None)) is not None:
             self._schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
 
-    def _frame_arrived(self, member: _SimulatedAgent, tracked: TrackedFrame) -> None:
+    def _frame_arrived(self, member: SimulatedRun, tracked: TrackedFrame) -> None:
         """Schedule the results of a frame, which waits until earlier frames are done, as in the agent's
         tracking thread."""
         begin_ns = max(self.now_ns, member.busy_until_ns)
@@ -162,6 +177,7 @@ class Simulation:
             is_keyframe=tracked.candidate is not None,
             new_segment=tracked.new_segment or member.frames_count == 0,
             error_cm=tracked.error_cm,
+            cov=tracked.cov,
         )
         member.frames_count += 1
         self._schedule(done_ns - self.now_ns, lambda: self._to_agent(member, frame))
@@ -172,7 +188,7 @@ class Simulation:
         member.busy_until_ns += self._draw(self._delays.finish_keyframe)
         self._schedule_next_frame(member)
 
-    def _to_agent(self, member: _SimulatedAgent, event: ev.AgentEvent) -> None:
+    def _to_agent(self, member: SimulatedRun, event: ev.AgentEvent) -> None:
         log = self.logs[member.name]
         for effect in member.machine.handle(event, self.now_ns):
             self._on_effect(member.name, effect)
@@ -189,7 +205,7 @@ class Simulation:
                     if effect.stamp_ns is not None and effect.corrected_ms is not None:
                         log.add_correction(effect.stamp_ns, effect.corrected_ms)
 
-    def _send_up(self, member: _SimulatedAgent, frames: Sequence[Bytes]) -> None:
+    def _send_up(self, member: SimulatedRun, frames: Sequence[Bytes]) -> None:
         size = message_bytes(frames)
 
         def on_air_done() -> None:
@@ -200,9 +216,7 @@ class Simulation:
 
         self._over_the_air(member, member.name, size, on_air_done)
 
-    def _over_the_air(
-        self, member: _SimulatedAgent, station: str, size: int, done: Callable[[], None]
-    ) -> None:
+    def _over_the_air(self, member: SimulatedRun, station: str, size: int, done: Callable[[], None]) -> None:
         """Call `done` when a message has passed the shared air of this member, at once without one."""
         if (air := self.airs.get(member.network)) is None:
             done()
@@ -256,6 +270,9 @@ class Simulation:
 
     # The mapper process, as in share.runtime.mapper_process.
 
+    def _schedule_mapper(self, delay_ns: int, action: Callable[[], None]) -> None:
+        self._schedule(delay_ns, action)
+
     def _send_to_mapper(self, delay: Delay, action: Callable[[], list[MapEvent]]) -> None:
         self._inbox.append((delay, action))
         if not self._is_busy:
@@ -271,15 +288,15 @@ class Simulation:
             spent_ns += self._draw(delay)
         self.mapper_busy_ns += spent_ns
         self._start_solving(spent_ns)
-        self._schedule(spent_ns, lambda: self._send_findings(findings))
+        self._schedule_mapper(spent_ns, lambda: self._send_findings(findings))
         step = self.mapper.next_lookup()
         if step is None:
-            self._schedule(spent_ns, self._mapper_idle)
+            self._schedule_mapper(spent_ns, self._mapper_idle)
             return
         result = _result_or_error(step.run)
         step_ns = self._draw(self._delay_of(step, result))
         self.mapper_busy_ns += step_ns
-        self._schedule(spent_ns + step_ns, lambda: self._step_done(step, result))
+        self._schedule_mapper(spent_ns + step_ns, lambda: self._step_done(step, result))
 
     def _step_done(self, step: Any, result: object) -> None:
         self._send_findings(self.mapper.finish_step(step, result, 0.0))
@@ -296,7 +313,7 @@ class Simulation:
             apply_result = partial(self.mapper.finish_step, step, result, 0.0)
             solve_ns = self._draw(self._delays.solve)
             self.solver_busy_ns += solve_ns
-            self._schedule(
+            self._schedule_mapper(
                 after_ns + solve_ns, lambda: self._send_to_mapper(self._delays.apply_solution, apply_result)
             )
 
@@ -338,9 +355,9 @@ def _result_or_error(action: Callable[[], object]) -> object:
         return error
 
 
-class _SimulatedAgent:
-    """An agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all frames that
-    arrived so far."""
+class SimulatedRun:
+    """A run of an agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all
+    frames that arrived so far."""
 
     def __init__(
         self,

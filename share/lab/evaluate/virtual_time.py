@@ -40,7 +40,7 @@ from share.runtime.error_estimators import (
     NoErrorEstimate,
     SynchronousErrorModel,
 )
-from share.runtime.offline_tracking import track_frames
+from share.runtime.offline_tracking import OfflineFrame, track_frames
 from share.runtime.pipeline import read_frames
 from share.runtime.run_files import AgentFiles
 from share.runtime.source import Source, open_source
@@ -129,18 +129,24 @@ def track_agent(
     """Return the rig and the tracked frames of a recording. error_source: as of `_track_all`."""
     tracker, errors = strict_tracker(source, settings), _error_estimator(source, error_source)
     frames = [
-        TrackedFrame(
-            arrival_ns=step.frame.stamp_ns - clock_offset_ns,
-            T_odom_body=step.result.T_odom_body,
-            error_cm=step.error_cm,
-            candidate=step.candidate,
-            stamp_ns=step.frame.stamp_ns,
-            state=step.result.state,
-            new_segment=step.result.new_segment,
-        )
+        tracked_frame(step, clock_offset_ns)
         for step in track_frames(read_frames(source, settings, SequencerCounters()), tracker, errors)
     ]
     return source.rig, frames
+
+
+def tracked_frame(step: OfflineFrame, clock_offset_ns: int) -> TrackedFrame:
+    """Return a frame with all that tracking made of it; it arrives when it is stamped."""
+    return TrackedFrame(
+        arrival_ns=step.frame.stamp_ns - clock_offset_ns,
+        T_odom_body=step.result.T_odom_body,
+        error_cm=step.error_cm,
+        candidate=step.candidate,
+        stamp_ns=step.frame.stamp_ns,
+        state=step.result.state,
+        new_segment=step.result.new_segment,
+        cov=step.result.cov,
+    )
 
 
 def _error_estimator(source: Source, error_source: str) -> ErrorEstimator:

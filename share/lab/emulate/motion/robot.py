@@ -25,7 +25,7 @@ _PIVOT_LEVER_M = 0.25  # path length that counts for a radian of turning in plac
 _MAX_DRIVEN_CORNER = 0.9  # rad, larger corners are turned in place
 _PIVOT_STEP_RAD = 0.02  # rad
 _WHEEL_SMOOTHING_S = 0.08  # sigma of the wheels' response
-_PITCH_PER_ACCEL = 0.010  # rad per m/s^2 of acceleration, by the castors' compliance
+PITCH_PER_ACCEL = 0.010  # rad per m/s^2 of acceleration, by the castors' compliance
 # lowest, strongest and highest frequency of vibration by wheels and floor
 _RUMBLE_BAND_HZ = (6.0, 17.0, 45.0)
 
@@ -81,16 +81,22 @@ def track_on_route(route: Route, steps: F64, duration: float) -> PlanarTrack:
 
 def imu_path(track: PlanarTrack, height: float, vibration: float, start_ns: int, rng: Rng) -> SplinePath:
     """Return the path of the camera's IMU. height: m. vibration: m/s^2, rms of the vertical at 0.3 m/s."""
-    strength = (np.abs(track.speed) / 0.3).clip(0, 3) ** 0.7 + 0.03  # never 0: fans run
-    shake = vibration * strength * np.stack([_rumble_displacement(len(track.seconds), rng) for _ in range(4)])
-    up, aside = shake[0], 0.3 * shake[1]
-    pitch, roll = 3.0 * shake[2], 2.0 * shake[3]  # rad per m, for a wheel base of 0.3 m
+    rumble = np.stack([rumble_displacement(len(track.seconds), rng) for _ in range(4)])
+    up, aside, pitch, roll = base_shake(track.speed, vibration, rumble)
     gain = np.gradient(track.speed, KNOT_S)
     left = np.stack([-np.sin(track.heading), np.cos(track.heading)], axis=1)
     p = np.column_stack([track.xy + aside[:, None] * left, height + up])
-    nose = CAMERA_PITCH + pitch + _PITCH_PER_ACCEL * gain
+    nose = CAMERA_PITCH + pitch + PITCH_PER_ACCEL * gain
     R = axis_rotation(2, track.heading) @ axis_rotation(1, -nose) @ axis_rotation(0, roll)
     return spline_through(start_ns, track.seconds, p, se3.quat_from_matrix(R @ CAMERA_AXES))
+
+
+def base_shake(speed: F64, vibration: float, rumble: F64) -> tuple[F64, F64, F64, F64]:
+    """Return how far the wheels and the floor shake a base up and aside, (M,) m each, and its pitch and roll,
+    (M,) rad each, at `speed` (M,) m/s. rumble (4, M): of `rumble_displacement`."""
+    strength = (np.abs(speed) / 0.3).clip(0, 3) ** 0.7 + 0.03  # never 0: fans run
+    shake = vibration * strength * rumble
+    return shake[0], 0.3 * shake[1], 3.0 * shake[2], 2.0 * shake[3]  # rad per m, for a wheel base of 0.3 m
 
 
 def _merge_legs(legs: Sequence[F64]) -> list[F64]:
@@ -120,7 +126,7 @@ def _pivot_route(xy: F64, before: float, after: float) -> Route:
     )
 
 
-def _rumble_displacement(count: int, rng: Rng) -> F64:
+def rumble_displacement(count: int, rng: Rng) -> F64:
     """Return displacement (M,) m whose acceleration has rms 1 m/s^2, in a band with one soft resonance."""
     hz = np.fft.rfftfreq(count, KNOT_S)
     low, peak, high = _RUMBLE_BAND_HZ

@@ -90,7 +90,7 @@ class FloorGraph:
 
         self.floor, self.radius = floor, radius
         self._cells = np.argwhere(floor.clearance >= radius)
-        graph = _cell_graph(floor, self._cells, radius)
+        graph = cell_graph(floor, self._cells, radius)
         _, part = connected_components(graph, directed=False)
         largest = np.flatnonzero(part == np.argmax(np.bincount(part))) if len(part) else np.zeros(0, int)
         self._cells, self._graph = self._cells[largest], graph[largest][:, largest]
@@ -191,7 +191,9 @@ def _angle_between(a: F64, b: F64) -> float:
     return float(abs(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)))
 
 
-def _cell_graph(floor: Floor, cells: Any, radius: float) -> Any:
+def cell_graph(floor: Floor, cells: Any, radius: float) -> Any:
+    """Return the ways between neighbouring cells (N, 2), indices into the floor's clearance, for a body of
+    `radius` m: a sparse matrix (N, N) of costs, m."""
     from scipy.sparse import coo_array
 
     number = np.full(floor.clearance.shape, -1)

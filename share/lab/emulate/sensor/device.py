@@ -21,6 +21,7 @@ from share.lab.emulate.sensor.imu import (
     knock_acceleration,
     measured_samples,
     rotation_rates,
+    saturate_and_quantise,
     vibration_acceleration,
 )
 from share.lab.emulate.types import MotionPath
@@ -148,30 +149,50 @@ class EmulatedDevice:
 
     # -- IMU ---------------------------------------------------------------------------------
 
-    def imu_streams(self, path: MotionPath) -> ImuStreams:
+    def imu_errors(self, seconds: float) -> tuple[F64, F64]:
+        """Return what noise and bias add to each sample of the gyroscope (N, 3) and accelerometer (M, 3) in
+        the device's first `seconds`."""
+        gyro, accel = (
+            self._with_errors(np.zeros((int(facts.rate_hz * seconds) + 2, 3)), facts, k, limits=False)
+            for k, facts in enumerate((self.profile.device.imu.gyro, self.profile.device.imu.accel))
+        )
+        return gyro, accel
+
+    def imu_streams(self, path: MotionPath, errors: tuple[F64, F64] | None = None) -> ImuStreams:
         """Return all IMU samples within the span of `path`: recorded ones as they are, else simulated. Stamps
-        are the device clock's."""
+        are the device clock's. errors: as from `imu_errors`, where `path` is a piece of a longer one."""
         if path.recorded is not None:
             stamps = self.clock.read(path.recorded.stamps_ns)
             return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel, self.clock.period_ns)
         facts = self.profile.device.imu
-        gyro_ns, gyro = self._sensor_samples(path, facts.gyro, _GYRO_STREAM, 0)
-        accel_ns, accel = self._sensor_samples(
-            path, facts.accel, _GYRO_STREAM if facts.joined else _ACCEL_STREAM, 1
-        )
+        accel_stream = _GYRO_STREAM if facts.joined else _ACCEL_STREAM
+        gyro_ns, gyro = self._sensor_samples(path, facts.gyro, _GYRO_STREAM, 0, errors)
+        accel_ns, accel = self._sensor_samples(path, facts.accel, accel_stream, 1, errors)
         return ImuStreams(gyro_ns, gyro, accel_ns, accel, self.clock.period_ns)
 
     def _sensor_samples(
-        self, path: MotionPath, sensor: InertialFacts, stream: int, sensor_index: int
+        self,
+        path: MotionPath,
+        sensor: InertialFacts,
+        stream: int,
+        sensor_index: int,
+        errors: tuple[F64, F64] | None,
     ) -> tuple[I64, F64]:
         index, true = self._stream(sensor.rate_hz, stream).sample_times(path.start_ns, path.end_ns)
         effects = self.effects
-        errors = (effects.imu_noise, effects.imu_bias, effects.imu_limits)
         with_vibration = path.inertial(true)[sensor_index] + self._vibration(true, sensor_index)
-        values = measured_samples(with_vibration, sensor, (*self._seed, _GYRO_STREAM, sensor_index), *errors)
+        if errors is None:
+            values = self._with_errors(with_vibration, sensor, sensor_index, effects.imu_limits)
+        else:
+            values = with_vibration + errors[sensor_index][index]
+            values = saturate_and_quantise(values, sensor) if effects.imu_limits else values
         sigma_ns = effects.imu_jitter_ms * 1e6
         error = clocks.stamp_jitter_ns((*self._seed, _JITTER_STREAM, stream), index, sigma_ns, sensor.rate_hz)
         return self.clock.read(true + error), values
+
+    def _with_errors(self, perfect: F64, sensor: InertialFacts, sensor_index: int, limits: bool) -> F64:
+        seed = (*self._seed, _GYRO_STREAM, sensor_index)
+        return measured_samples(perfect, sensor, seed, self.effects.imu_noise, self.effects.imu_bias, limits)
 
     def _vibration(self, times_ns: I64, sensor_index: int) -> F64:
         """Return what vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""

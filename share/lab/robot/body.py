@@ -1,0 +1,78 @@
+"""The true path of the robot's camera and IMU, which grows as the robot drives.
+
+It is a uniform quintic B-spline whose control points are the body's poses each STEP_S: C4 as the emulator's
+other paths, so what the IMU feels is exact; and local, so that a piece once driven never changes. A pose
+depends on control points up to LOOK_AHEAD_NS later, which a drive's latency leaves known.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.geometry import se3
+from share.lab.emulate.motion.robot import PITCH_PER_ACCEL, base_shake, rumble_displacement
+from share.lab.emulate.motion.spline import SPLINE_DEGREE, SplinePath, continuous_quaternions
+from share.lab.emulate.motion.walk import axis_rotation
+from share.lab.emulate.types import START_NS
+from share.lab.robot.drive import STEP_NS, STEP_S, DriveStep
+from share.types import F64
+
+LOOK_AHEAD_NS = 3 * STEP_NS
+_VIBRATION_M_S2 = 0.4  # as the emulator's `robot:`
+_BEFORE = 2  # control points before time 0
+
+
+class BodyPath:
+    """The path of a body mounted at T_base_body (4, 4) on a base. seconds: the longest drive, for which the
+    floor's rumble is drawn. Control point k is the pose at (k - _BEFORE) STEP_S."""
+
+    def __init__(self, T_base_body: F64, seconds: float, rng: np.random.Generator) -> None:
+        self._T_base_body = T_base_body
+        count = int(seconds / STEP_S) + 100
+        self._rumble = np.stack([rumble_displacement(count, rng) for _ in range(4)])
+        self._points = np.empty((count, 7))  # position, quaternion
+        self._count = 0
+
+    def add(self, step: DriveStep) -> None:
+        """Add the base after its next step; first at time 0, before which it is at rest."""
+        for _ in range(1 if self._count else 1 + _BEFORE):
+            self._append(step)
+
+    def _append(self, step: DriveStep) -> None:
+        k = self._count
+        speed = np.array([step.speed_m_s])
+        up, aside, pitch, roll = base_shake(speed, _VIBRATION_M_S2, self._rumble[:, k : k + 1])
+        nose = pitch + PITCH_PER_ACCEL * np.clip(step.acceleration_m_s2, -2.0, 2.0)
+        T = step.T_world_base
+        R = axis_rotation(2, np.array([T.yaw])) @ axis_rotation(1, -nose) @ axis_rotation(0, roll)
+        p = np.array([T.x, T.y, 0.0]) + R[0] @ np.array([0.0, aside[0], up[0]])
+        T_world_body = se3.from_rt(R[0], p) @ self._T_base_body
+        self._points[k] = *T_world_body[:3, 3], *se3.quat_from_matrix(T_world_body[:3, :3])
+        self._points[max(k - 1, 0) : k + 1, 3:] = continuous_quaternions(
+            self._points[max(k - 1, 0) : k + 1, 3:]
+        )
+        self._count += 1
+
+    @property
+    def known_until_ns(self) -> int:
+        """Session time until which the path is known."""
+        return (self._count - 1 - _BEFORE) * STEP_NS - LOOK_AHEAD_NS
+
+    def part(self, first_ns: int, last_ns: int) -> SplinePath:
+        """Return the path from one session time to another, or a little more. Raises ValueError where it is
+        not known."""
+        if not 0 <= first_ns <= last_ns <= self.known_until_ns:
+            raise ValueError(f"{first_ns} .. {last_ns} ns: the path is known until {self.known_until_ns} ns")
+        from scipy.interpolate import BSpline
+
+        # control point k is the middle of its B-spline, which spans three steps to both sides
+        first, last = first_ns // STEP_NS, last_ns // STEP_NS + 6
+        points = self._points[first : last + 1]
+        knots = STEP_S * (np.arange(len(points) + SPLINE_DEGREE + 1) - SPLINE_DEGREE)
+        start_ns = START_NS + first * STEP_NS
+        return SplinePath(
+            start_ns,
+            start_ns + (len(points) - SPLINE_DEGREE) * STEP_NS,
+            BSpline(knots, points[:, :3], SPLINE_DEGREE),
+            BSpline(knots, points[:, 3:], SPLINE_DEGREE),
+        )
