@@ -15,7 +15,7 @@ from share.odometry import feature_appearance, feature_matching, filter, initial
 from share.odometry.dormant_features import DormantFeatures
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches, Prediction
-from share.odometry.state import FilterState
+from share.odometry.state import GYRO_BIAS, FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import field_mask
@@ -30,7 +30,10 @@ _AVOID_FRAMES = 30  # for which no feature is searched where a dynamic feature w
 _MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution,
 _CAUTION_FRAMES = 60  # frames of it after the last such frame
 _PROBATION_S = 0.34  # after which a static feature is proven
-_UNPROVEN_NOISE_SCALE = 5.0  # of an unproven feature's sigma, in a time of caution
+_SUSPECT_NOISE_SCALE = 5.0  # of the sigma of a feature that may move
+_UNKNOWN_BIAS_SIGMA = 2e-3  # rad/s, of the gyroscope; with more, rotation may pass for translation
+_NEAR_RATIO = 2.0  # of a near feature's inverse depth to the median
+_MAX_NEAR_SHARE = 0.25  # of the features; more than these are a part of the room
 _SLANT_PERIOD = 4  # frames between updates of a feature's slant
 _MIN_RHO, _MIN_DEPTH_M = 0.03, 0.2  # 1/m; m
 _UNKNOWN_RHO_SIGMA = 0.05  # 1/m; half a pixel a frame at walking speed
@@ -203,11 +206,16 @@ class LandmarkMap:
         return predicted, uv
 
     def _with_inflated_noise(self, rows: filter.FeatureMeasurements) -> filter.FeatureMeasurements:
-        """Return measurements with more noise for unproven features, in a time of caution."""
-        if self._caution_frames == 0:
+        """Return measurements with more noise for features that may move: unproven ones in a time of caution,
+        and a near few while rotation may pass for translation."""
+        suspect = np.zeros(len(self.state.feature_ids), bool)
+        if self._caution_frames > 0:
+            suspect |= self.appearance.age < self._probation_frames
+        if self.state.cov.diagonal()[GYRO_BIAS].max() > _UNKNOWN_BIAS_SIGMA**2:
+            suspect |= _near_few(initial_depth.current_rho(self.state))
+        if not suspect.any():
             return rows
-        unproven = ~self.is_proven(rows.feature)
-        noise_scale = np.where(unproven, _UNPROVEN_NOISE_SCALE, 1.0)
+        noise_scale = np.where(suspect[rows.feature], _SUSPECT_NOISE_SCALE, 1.0)
         return replace(
             rows, sigma=noise_scale * rows.sigma, correlated_sigma=noise_scale * rows.correlated_sigma
         )
@@ -338,3 +346,12 @@ class LandmarkMap:
         self._dormant.drop_keyframes(s.keyframe_ids[dropped])
         self.appearance = self.appearance.take(~dropped[s.anchor])
         state.drop_keyframes(s, s.keyframe_ids[dropped])
+
+
+def _near_few(rho: F64) -> NDArray[np.bool_]:
+    """Return which features (N,) with inverse depths rho are much nearer than most, if they are few.
+
+    They say the most about translation: one who stands before the camera and sways outweighs a room.
+    """
+    near: NDArray[np.bool_] = rho > _NEAR_RATIO * np.median(rho)
+    return near & (near.mean() < _MAX_NEAR_SHARE)

@@ -1,6 +1,7 @@
-"""Accuracy of the inertial tracker over 60 s: emulated sequences x seeds. Prints a Markdown table.
+"""Accuracy of the inertial tracker: emulated sequences x seeds. Prints a Markdown table.
 
-    python tools/experiments/measure_vio.py [--only NAME] [--seeds 101,102,103] [--data FOLDER] [--again]
+    python tools/experiments/measure_vio.py [--only NAME] [--seeds 101,102,103] [--seconds 60] [--hz 30]
+        [--data FOLDER] [--again]
 
 Causal poses of every frame. Sessions are made once (minutes each) and kept in the cache; a run by the same
 code is not repeated. In --out: a JSON and the series of each run, table.md, a PNG a sequence.
@@ -23,7 +24,7 @@ import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 from vio_picture import Curves, draw  # noqa: E402
 from vio_run import figures, follow, series  # noqa: E402
-from vio_sequences import SECONDS, Sequence, chosen_sequences, code_version, keep, kept  # noqa: E402
+from vio_sequences import Sequence, chosen_sequences, code_version, keep, kept  # noqa: E402
 from vio_sequences import parser as sequences_parser  # noqa: E402
 
 from share.config import Config  # noqa: E402
@@ -88,7 +89,7 @@ def measure(options: argparse.Namespace) -> None:
 def run(sequence: Sequence, seed: int, options: argparse.Namespace, code: str) -> Row:
     """Return a run's figures from its JSON if that is of this code and session, else do the run and keep
     it."""
-    recipe = sequence.recipe(seed, options.data)
+    recipe = sequence.recipe(seed, options)
     made_by = {"sequence": sequence.name, "seed": seed, "code": code, "session": recipe.digest}
     file = _file(options.out, sequence.name, seed)
     if not options.again and (known := kept(file, made_by)) is not None:
@@ -116,7 +117,7 @@ def picture(sequence: Sequence, rows: list[Row], options: argparse.Namespace) ->
     for row in rows:
         with np.load(_file(options.out, sequence.name, row["seed"]).with_suffix(".npz")) as curves:
             runs.append(Curves(f"seed {row['seed']}: ATE {_cm(row)}", **curves))
-    what = f"{sequence.motion.rstrip(':')} in {sequence.scene}, {sequence.profile}, {SECONDS:g} s"
+    what = f"{sequence.motion.rstrip(':')} in {sequence.scene}, {sequence.profile}, {options.seconds:g} s"
     draw(options.out / f"{sequence.name}.png", f"{sequence.name}: {what}", runs)
 
 

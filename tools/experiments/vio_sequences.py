@@ -1,4 +1,4 @@
-"""Sequences x seeds for measuring trackers: one agent, 60 s, all sensor effects.
+"""Sequences x seeds for measuring trackers: one agent, all sensor effects.
 
 Also the options of the tools that run over them, and the cache of a run's figures.
 """
@@ -18,15 +18,17 @@ import share
 from share.errors import UsageError
 from share.files.writing import atomic_write
 from share.lab.emulate.recipe import SessionRecipe
+from share.recordings import tables
+from share.recordings.trajectory import format_tum, make_trajectory
 
-SECONDS = 60.0
 _D435I = "d435i:640x480@30"
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """motion: `walk:`, `robot:`, or `euroc:NAME`, `tumvi:NAME` of a recording in the folder of recordings.
-    size: of the room, m; None: the scene's default. sensors: "" for the motion's usual ones."""
+    """motion: `walk:`, `robot:`, or `euroc:NAME`, `tumvi:NAME`, `tum:FILE` of a recording in the folder of
+    recordings; `tum:` is a table of poses, with a simulated IMU. size: of the room, m; None: the scene's
+    default. sensors: "" for the motion's usual ones."""
 
     name: str
     motion: str
@@ -36,17 +38,35 @@ class Sequence:
     size: tuple[float, float, float] | None = None
 
     def recording(self, data: Path) -> Path | None:
-        """Return its recording's folder in `data`, None for a simulated motion."""
+        """Return its recording's folder or file in `data`, None for a simulated motion."""
         kind, _, name = self.motion.partition(":")
-        return data / kind / name if name else None
+        if not name:
+            return None
+        return data / name if kind == "tum" else data / kind / name
 
-    def recipe(self, seed: int, data: Path) -> SessionRecipe:
-        folder = self.recording(data)
-        motion = self.motion if folder is None else f"{self.motion.partition(':')[0]}:{folder}"
+    def recipe(self, seed: int, options: argparse.Namespace) -> SessionRecipe:
+        """Return the recipe with `seed`; options: data, seconds and hz of `parser`."""
+        kind, recording = self.motion.partition(":")[0], self.recording(options.data)
+        if recording is not None and kind == "tum":
+            recording = _as_tum(recording)
+        motion = self.motion if recording is None else f"{kind}:{recording}"
+        profile = self.profile
+        if options.hz is not None and "@" in profile:
+            profile = f"{profile.partition('@')[0]}@{options.hz}"
         sensors = {"": self.sensors} if self.sensors else {}
         return SessionRecipe(
-            self.scene, (f"agent={motion}",), SECONDS, seed, self.size, sensors, {"": self.profile}
+            self.scene, (f"agent={motion}",), options.seconds, seed, self.size, sensors, {"": profile}
         )
+
+
+def _as_tum(table: Path) -> Path:
+    """Return a TUM file, in build/, of a table of poses: time (ns), position, quaternion with w first."""
+    out = ROOT / "build" / "motions" / f"{table.stem}.tum"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    stamps_ns, values = tables.read_table(table, 8)
+    poses = make_trajectory(stamps_ns, values[:, :3], values[:, [4, 5, 6, 3]], table, None)
+    atomic_write(out, format_tum(poses))
+    return out
 
 
 SEQUENCES = (
@@ -56,9 +76,12 @@ SEQUENCES = (
     Sequence("euroc-V1_01", "euroc:V1_01_easy", "warehouse", "euroc"),
     Sequence("euroc-V1_02", "euroc:V1_02_medium", "firestation", "euroc"),
     Sequence("euroc-MH_03", "euroc:MH_03_medium", "warehouse", "euroc", size=(10.0, 9.5, 4.5)),
+    Sequence("euroc-MH_01", "euroc:MH_01_easy", "warehouse", "euroc", size=(10.0, 9.5, 4.5)),
     Sequence("tumvi-room1", "tumvi:room1", "warehouse", _D435I),
     Sequence("tumvi-room2", "tumvi:room2", "firestation", _D435I),
     Sequence("tumvi-room3", "tumvi:room3", "warehouse", _D435I),
+    Sequence("table_01", "tum:rpng_plane/table_01.csv", "warehouse", _D435I),
+    Sequence("table_02", "tum:rpng_plane/table_02.csv", "firestation", _D435I),
 )
 
 
@@ -72,7 +95,9 @@ def parser(doc: str | None, out: str, seeds: tuple[int, ...]) -> argparse.Argume
     names = [sequence.name for sequence in SEQUENCES]
     made.add_argument("--only", action="append", choices=names, help="may be repeated")
     made.add_argument("--seeds", type=_seeds, default=seeds, metavar="N,N,…")
-    made.add_argument("--data", type=_folder, default=_DATA, help="recordings: euroc/NAME, tumvi/NAME")
+    made.add_argument("--seconds", type=float, default=60.0)
+    made.add_argument("--hz", type=int, help="frame rate of the D435i, in place of 30")
+    made.add_argument("--data", type=_folder, default=_DATA, help="recordings: euroc/NAME, tumvi/NAME, …")
     made.add_argument("--cache", type=Path, help="of sessions (default: the user's)")
     made.add_argument("--out", type=Path, default=ROOT / "build" / out)
     made.add_argument("--workers", type=int, default=2, help="processes that make sessions")
