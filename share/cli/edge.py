@@ -47,7 +47,8 @@ if TYPE_CHECKING:
     "allow",
     type=click.Choice(["commands", "objects"]),
     multiple=True,
-    help="Without keys: let everyone on this machine send robots, or place objects. May be repeated.",
+    help="Without keys: what all on this machine may do: commands (send robots), objects (place them). "
+    "May be repeated.",
 )
 @click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
 @options.config

@@ -34,7 +34,12 @@ def marker() -> None:
 @click.option(
     "--yaw", type=float, default=0.0, help="Where it faces, degrees counterclockwise from the map's x."
 )
-@click.option("--kind", type=click.Choice(["marker", "cube"]), default="marker", help="What it is shown as.")
+@click.option(
+    "--kind",
+    type=click.Choice(["marker", "cube"]),
+    default="marker",
+    help="What it is shown as: marker or cube.",
+)
 @click.option("--id", "object_id", type=click.IntRange(0, 2**31 - 1), help="Its id.  [default: a new one]")
 @click.option(
     "--map-id", metavar="ID", help="Map in which it is meant.  [default: that of your agent, or the only one]"

@@ -69,6 +69,9 @@ tr.gone { color: var(--dim) }
 <h2>Plan</h2><div id="plan"></div>
 <h2>Agent consistency</h2><div class="wide"><table id="consistency"></table></div>
 <h2>Maps</h2><div class="wide"><table id="maps"></table></div>
+<h2>Robots</h2><div class="wide"><table id="robots"></table></div>
+<h2>Objects</h2><div class="wide"><table id="objects"></table></div>
+<h2>Clients</h2><div class="wide"><table id="clients"></table></div>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
 </main>
@@ -245,6 +248,13 @@ function show(now) {
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
     id, typeof count === "object" ? count?.keyframes : count,
     agents.filter(([, a]) => String(a.map_id) === id).map(([name]) => name).join(", ")]})));
+  const place = p => p ? p.slice(0, 2).map(v => fixed(v, 2)).join(", ") : "–";
+  table("robots", ["robot", "x, y (m)", "map", "what it does"], entries(now.robots).map(([name, robot]) =>
+    ({cells: [name, place(robot.pose), robot.map_id, robot.text]})));
+  table("objects", ["object", "kind", "owner", "x, y (m)", "map"], entries(now.objects).map(([id, it]) =>
+    ({cells: [id, it.kind, it.owner, place(it.position), it.map_id]})));
+  const clients = now.clients ?? [];
+  table("clients", ["client", "drives a robot", "refused messages", "the last"], clients.map(one => ({cells: [one.name, one.drives_robot ? "yes" : "", one.refused_messages, one.last_refusal]})));
   const loops = now.loops ?? {};
   table("loops", ["tried", "accepted", "waiting for a supporting loop", "in the maps", "merges"],
     now.loops ? [{cells: [loops.tried, loops.accepted, loops.waiting, loops.in_map, now.merges?.done]}] : []);

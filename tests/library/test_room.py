@@ -14,12 +14,15 @@ import pytest
 from click.testing import CliRunner
 from helpers.room_server import MAP, RoomServer
 
-from share import Room, ShareError
+from share import Edge, Room, ShareError
 from share.cli.main import cli
 from share.errors import UsageError
+from share.mapping.map_changes import SaveObject
+from share.net import keys
 from share.protocol.room_events import BridgeSaid, RobotCommanded
 from share.runtime.room_link import RoomLink
-from share.wire.room_messages import Cancel, CommandState, Permission, RobotPlace
+from share.store.map_store import MapStore
+from share.wire.room_messages import Cancel, CommandState, ObjectKind, Permission, RobotPlace, RoomObject
 
 pytestmark = pytest.mark.long
 ROOT = Path(__file__).resolve().parents[2]
@@ -180,6 +183,37 @@ def test_who_may_not_command_by_the_edge(tmp_path) -> None:
     with RoomServer({Permission.OBJECTS}) as server, Robot(server.address) as robot:
         refused = share("robot", "goto", "1", "2", "--edge", server.address, "--name", "eve")
         assert "nobody may command robots here" in str(refused.exception) and not robot.commands
+
+
+def test_with_keys_the_list_says_who_may_and_a_change_counts_at_once(tmp_path) -> None:
+    for name in ("edge", "ann"):
+        keys.generate_pair(tmp_path / name, name)
+    own, ann = keys.load_pair(tmp_path / "edge"), keys.load_pair(tmp_path / "ann")
+    keys.authorize(tmp_path / "edge", "ann", ann.public)
+    with Edge("tcp://127.0.0.1:0", keys=tmp_path / "edge") as edge:
+        with Room(edge.endpoint, "ann", keys=tmp_path / "ann", server_key=own.public) as room:
+            line = "the key of 'ann' may not place objects; on the edge run: share keys authorize … --objects"
+            with pytest.raises(ShareError, match=line):
+                room.put("cube", (0, 0, 0), map_id=MAP)
+            keys.authorize(tmp_path / "edge", "ann", ann.public, permissions={Permission.OBJECTS: True})
+            time.sleep(0.5)
+            with pytest.raises(ShareError, match=f"there is no map {MAP}"):
+                room.put("cube", (0, 0, 0), map_id=MAP)
+        with pytest.raises(ShareError, match="its key is authorized for 'ann', not for 'bob'"):
+            Room(edge.endpoint, "bob", keys=tmp_path / "ann", server_key=own.public).start()
+
+
+def test_objects_survive_the_edge_with_its_map_file(tmp_path) -> None:
+    kept = RoomObject(1, 1, 7, ObjectKind.CUBE, "ann", MAP, np.eye(4))
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write([SaveObject(kept, MAP)])
+    options = {"map_file": tmp_path / "room.sqlite", "allow": ["objects"]}
+    with Edge("tcp://127.0.0.1:0", **options) as edge, Room(edge.endpoint, "bob") as room:
+        assert room.objects[7].owner == "ann"
+        room.remove(7)
+        assert edge.report()["config"]
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        assert store.load().objects == ()
 
 
 def test_the_example(server) -> None:

@@ -19,6 +19,7 @@ from share.net import keys
 from share.net.keys import AgentKeys, AllowList, EdgeKeys, KeyPair
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.wire.messages import peer_id
+from share.wire.room_messages import Permission
 
 
 def text(*paths: Path) -> str:
@@ -169,6 +170,38 @@ def test_authorize_and_revoke(tmp_path: Path) -> None:
     assert [allowed.is_allowed(key(n)) for n in (1, 2)] == [False, True]
     with pytest.raises(UsageError, match="'ann' is not authorized; authorized are: bob"):
         keys.revoke(tmp_path, "ann")
+
+
+def test_what_a_key_may_do_as_a_client_is_given_kept_and_taken_back(tmp_path: Path) -> None:
+    public, allowed = zmq.curve_keypair()[0].decode(), keys.allow_list(tmp_path)
+    keys.authorize(tmp_path, "headset1", public, ["ann", "carol"])
+    assert allowed.permissions_of(public) == frozenset()
+    keys.authorize(tmp_path, "headset1", public, permissions={Permission.COMMANDS: True})
+    keys.authorize(tmp_path, "headset1", public, permissions={Permission.OBJECTS: True})
+    assert (
+        text(tmp_path / "authorized") == f"share-public-key headset1 {public} ann carol +commands +objects\n"
+    )
+    assert allowed.permissions_of(public) == frozenset(Permission)
+    keys.authorize(tmp_path, "headset1", public, ["bob"], {Permission.COMMANDS: False})
+    assert allowed.permissions_of(public) == {Permission.OBJECTS}
+    assert allowed.agents_for(public) == {"bob"}
+    assert allowed.permissions_of("x" * 40) == frozenset()
+
+
+@pytest.mark.parametrize("words", ["+drive", "+commands ann", "commands+", "+ objects"])
+def test_an_unknown_permission_damages_the_list(words: str, tmp_path: Path) -> None:
+    public = zmq.curve_keypair()[0].decode()
+    (tmp_path / "authorized").write_text(f"share-public-key ann {public} {words}\n")
+    assert keys.allow_list(tmp_path).permissions_of(public) == frozenset()
+    assert "line 1" in str(keys.allow_list(tmp_path).trouble())
+
+
+def test_with_keys_the_list_says_who_may_and_no_option() -> None:
+    assert keys.allowed_without_keys(["objects"], False) == {Permission.OBJECTS}
+    with pytest.raises(UsageError, match="--allow: with keys the list says who may"):
+        keys.allowed_without_keys(["objects"], True)
+    with pytest.raises(UsageError, match="--allow 'all': known are commands, objects"):
+        keys.allowed_without_keys(["all"], False)
 
 
 def test_one_name_one_key(tmp_path: Path) -> None:

@@ -15,8 +15,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.hellos import hello_of
+from helpers.room_bench import RoomBench, at
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
@@ -29,6 +31,7 @@ from share.runtime import edge_metrics, web
 from share.runtime.status_server import CACHE_S, StatusServer
 from share.wire.codec import encode
 from share.wire.messages import peer_id
+from share.wire.room_messages import RobotPlace
 
 AGENT = {
     "kind": "ar",
@@ -290,6 +293,25 @@ def test_the_page_shows_the_consistency_of_agents():
     assert 'id="consistency"' in page and '["set apart", "disputed"].includes' in page
     assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= reported.keys()
     assert {"reason", "log_scale", "sigma", "put_right"} <= set(re.findall(r"\bc\.(\w+)", page))
+
+
+def test_the_page_shows_objects_robots_and_clients():
+    """Each field that the page reads is one of the edge's report."""
+    bench = RoomBench()
+    bench.correct(bench.agent("ann", 1), "ann-1/0", np.eye(4))
+    bot = bench.client("bot", 11, drives_robot=True)
+    bench.run(0.1)
+    bench.put(bot, 1, 7, at(1, 2), "ann-1/0")
+    bench.said(bot, RobotPlace(None, "ann-1/0", 1.0, 2.0, 0.5, "reached"))
+    bench.run(0.1)
+    report = bench.edge.report({})
+    fields = {"it": report["objects"]["7"], "robot": report["robots"]["bot"], "one": report["clients"][0]}
+    with serving(lambda: report) as server:
+        assert json.loads(get(server, "/snapshot.json")[2])["objects"] == report["objects"]
+        page = get(server, "/")[2].decode()
+    for name, reported in fields.items():
+        read = set(re.findall(rf"\b{name}\.(\w+)", page))
+        assert read and read <= reported.keys()
 
 
 # ---------------------------------------------------------------- what goes wrong

@@ -249,7 +249,7 @@ class Keys:
             public = _keys(folder / name, "generate", "--name", name)
             if name != names[-1]:
                 of = [f"--agent={agent}" for agent in AGENTS_OF.get(name, ())]
-                _keys(keys.edge, "authorize", name, public, *of)
+                _keys(keys.edge, "authorize", name, public, *of, "--commands", "--objects")
         return keys
 
     def of(self, name: str) -> tuple[str, str, str]:
@@ -297,7 +297,7 @@ class EdgeProgram(Program):
         arguments += ["--map", str(self.map)] if self.map else []
         arguments += ["--http", "127.0.0.1:0"] if setup.http else []
         arguments += ["--policy", policy]
-        arguments += ["--keys", str(keys.edge)] if keys else []
+        arguments += ["--keys", str(keys.edge)] if keys else ["--allow", "commands", "--allow", "objects"]
         super().__init__(folder / f"edge{life}.log", [*SHARE, "edge", *arguments], env)
         port = self.wait_for(r"listening on tcp://\S+?:(\d+),")[1]
         self.address = f"tcp://127.0.0.1:{port}"
