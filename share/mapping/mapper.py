@@ -92,9 +92,9 @@ class Mapper:
             events = [map_assignment(agent, map_id, T_map_odom, keyframe.id)]
         if redundant := self.atlas.culling.next_nodes(self._config.edge.max_keyframes):
             self.remove_keyframes(redundant)
-        if gone := self.atlas.renewal.take_gone():
-            self.remove_keyframes(gone)
-            events.append(MapEvent(agent, "map renewed", f"{len(gone)} keyframes show what is gone"))
+        if outdated := self.atlas.renewal.take_outdated():
+            self.remove_keyframes(outdated)
+            events.append(MapEvent(agent, "map renewed", f"{len(outdated)} keyframes show what is gone"))
         return events
 
     def remove_keyframes(self, node_ids: Sequence[int]) -> None:

@@ -32,7 +32,7 @@ class PeerLimits:
     bytes_per_s: float
 
 
-class Door:
+class PeerConnections:
     """The connections of one server."""
 
     def __init__(self, limits: PeerLimits) -> None:
@@ -87,19 +87,19 @@ class Allowance:
 class BoundedConnection(ServerConnection):  # type: ignore[misc]
     """A connection through a door. Given as `create_connection=partial(BoundedConnection, door=door)`."""
 
-    def __init__(self, *args: Any, door: Door, **options: Any) -> None:
+    def __init__(self, *args: Any, connections: PeerConnections, **options: Any) -> None:
         super().__init__(*args, **options)
-        limits = door.limits
-        self._door = door
+        limits = connections.limits
+        self._peer_connections = connections
         self._frames = Allowance(limits.burst, limits.frames_per_s)
         self._bytes = Allowance(limits.burst_bytes, limits.bytes_per_s)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self._door.arrive(self)
+        self._peer_connections.arrive(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._door.leave(self)
+        self._peer_connections.leave(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:

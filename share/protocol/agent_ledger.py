@@ -147,10 +147,10 @@ class KeyframeLedger:
         self._buffered_at_edge = frozenset(ack.buffered)
         if max_buffered in self._pending:  # it was in flight when this session began
             self._max_sent_id = max(self._max_sent_id, max_buffered)
-        self._hasten_overtaken()
+        self._bring_resends_forward()
         return True
 
-    def _hasten_overtaken(self) -> None:
+    def _bring_resends_forward(self) -> None:
         """Make each gap due soon: a keyframe that has not arrived though a later one, sent after it, has.
 
         Once for each time that it is sent: an acknowledgement that is repeated says nothing new."""
@@ -272,7 +272,7 @@ class KeyframeChain:
             ):  # more accurate than the candidates' chain
                 T_ref_body = orthonormal(earlier.T_earlier_body[-1].astype(np.float64))
                 cov = earlier.cov[-1].astype(np.float64)
-            earlier = spread_earlier(earlier, self.next_id)
+            earlier = select_earlier(earlier, self.next_id)
         keyframe = Keyframe(
             id=self.next_id,
             reference=self.next_id - 1 if self._has_reference else -1,
@@ -312,7 +312,7 @@ class KeyframeChain:
 _EARLIER_STEPS = 3, 7, 13  # keyframes back, to which a keyframe's pose is sent beside that to its reference
 
 
-def spread_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
+def select_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
     """Return the poses relative to the keyframes nearest to `_EARLIER_STEPS` before this one.
 
     A chain of steps between neighbours loses what the tracker knows of longer ones: its window."""

@@ -150,8 +150,8 @@ class Edge:
         computation_ms, t_s = peer.computation.ms, self._out.elapsed_s
         grant = self._rate_scheduler.evaluate(peer.name, report, computation_ms, t_s)
         self._membership.send_grant(peer, grant)
-        if (news := self._rate_scheduler.capacity_news(self._out.now_ns)) is not None:
-            self._out.record("room full", None, news)
+        if (change := self._rate_scheduler.capacity_change(self._out.now_ns)) is not None:
+            self._out.record("room full", None, change)
 
     def _on_other_version(self, peer_id: bytes, error: VersionError) -> None:
         self._registry.unjoined.counts["other_version"] += 1

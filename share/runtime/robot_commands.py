@@ -132,7 +132,7 @@ class CommandServer:
 
     def report(self, report: ev.GoalReport) -> None:
         """Tell a commander of its goal, and all that watch."""
-        self.tell_watchers({"commander": report.commander, "goal": report.text})
+        self.notify_watchers({"commander": report.commander, "goal": report.text})
         connection = self._connections.get(report.commander)
         if connection is not None:
             form = {"goal": report.text, "is_final": report.is_final, "is_reached": report.is_reached}
@@ -144,9 +144,9 @@ class CommandServer:
         if any(one.is_watching for one in self._connections.values()) and self._watch_timer.fire_if_due(
             now_ns
         ):
-            self.tell_watchers({"state": state()})
+            self.notify_watchers({"state": state()})
 
-    def tell_watchers(self, message: dict[str, Any]) -> None:
+    def notify_watchers(self, message: dict[str, Any]) -> None:
         for connection in self._connections.values():
             if connection.is_watching:
                 self._send(connection, message)

@@ -58,7 +58,7 @@ class AgentAir:
     is_placed: bool = True
 
     @property
-    def elsewhere_ms(self) -> float:
+    def other_delay_ms(self) -> float:
         """Part of the delay that is not the air's, ms."""
         return max(0.0, self.delay_ms - 1e3 * self.keyframe_s)
 
@@ -121,13 +121,13 @@ class RoomBudget:
         times = [self.air_s(agent) for agent in self.agents.values()]
         return None if not times else median(times) if len(times) > 2 else min(times)
 
-    def is_short(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> bool:
-        """Whether not everyone can send what it wants with less than `noticed_ms` on the air."""
-        return _Prediction(self, is_thinned=False).is_noticed(noticed_ms)
+    def is_short(self, max_delay_ms: float = ACCEPTED_DELAY_MS) -> bool:
+        """Whether not everyone can send what it wants with less than `max_delay_ms` on the air."""
+        return _Prediction(self, is_thinned=False).exceeds_delay(max_delay_ms)
 
-    def allocate(self, noticed_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
+    def allocate(self, max_delay_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
         """Return what every agent may send where the air is short."""
-        rates = _Prediction(self, is_thinned=True).allocate(noticed_ms)
+        rates = _Prediction(self, is_thinned=True).allocate(max_delay_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
@@ -155,32 +155,34 @@ class _Prediction:
         self._pose_load = POSE_COST * float(pose_hz @ self._air_s)
         self._weight = np.array([_WEIGHT[form] for form in forms])
         is_headset = np.array([form is AgentKind.AR for form in forms])
-        self._comes_first = is_headset | ~is_headset.any()  # others may be delayed for it
+        self._has_priority = is_headset | ~is_headset.any()  # others may be delayed for it
         self._least_hz = np.array([agent.least_hz for agent in agents])
         self._wanted_hz = np.array([agent.wanted_hz for agent in agents])
-        self._elsewhere_ms = np.array([agent.elsewhere_ms for agent in agents])
+        self._other_delay_ms = np.array([agent.other_delay_ms for agent in agents])
         self._terms = QoeTable.of([agent.terms for agent in agents])
         self._error_cm = np.array([math.nan if a.error_cm is None else a.error_cm for a in agents])
         self._drift_cm = np.minimum([agent.drift_cm for agent in agents], self._error_cm)
         self._measured_hz = np.maximum([agent.hz for agent in agents], 1e-3)
 
-    def is_noticed(self, noticed_ms: float) -> bool:
+    def exceeds_delay(self, max_delay_ms: float) -> bool:
         """Return whether keyframes at the wanted rates take longer on the air than a wearer notices."""
-        return bool(self._is_noticed(self._load(self._wanted_hz), noticed_ms))
+        return bool(self._exceeds_delay(self._load(self._wanted_hz), max_delay_ms))
 
-    def allocate(self, noticed_ms: float) -> dict[str, float]:
+    def allocate(self, max_delay_ms: float) -> dict[str, float]:
         """Return the rates, Hz: least ones, then steps to whom they gain most; while nobody notices, those of
         who comes first before those of others."""
         hz = self._least_hz.copy()
         while len(hz) and (load := self._load(hz)) < MAX_LOAD:
             is_open = hz + _STEP_HZ <= self._wanted_hz
             gain = self._gain(hz, load) / np.maximum(self._air_s, 1e-6)
-            is_free = is_open & ~self._is_noticed(self._capped(load + _STEP_HZ * self._air_s), noticed_ms)
-            steps = is_free & self._comes_first
+            is_free = is_open & ~self._exceeds_delay(
+                self._capped(load + _STEP_HZ * self._air_s), max_delay_ms
+            )
+            steps = is_free & self._has_priority
             if not steps.any():
                 steps = is_free
             if not steps.any():
-                steps = is_open & self._comes_first & (gain > _STEP_HZ * self._cost(hz, load))
+                steps = is_open & self._has_priority & (gain > _STEP_HZ * self._cost(hz, load))
             if not steps.any():
                 break
             hz[np.argmax(np.where(steps, gain, -np.inf))] += _STEP_HZ
@@ -192,8 +194,8 @@ class _Prediction:
     def _capped(self, load: F64 | float) -> F64:
         return np.minimum(load, MAX_LOAD)
 
-    def _is_noticed(self, load: F64 | float, noticed_ms: float) -> NDArray[np.bool_]:
-        return np.asarray(self._usual_air_s / (1 - np.asarray(load)) > noticed_ms / 1e3)
+    def _exceeds_delay(self, load: F64 | float, max_delay_ms: float) -> NDArray[np.bool_]:
+        return np.asarray(self._usual_air_s / (1 - np.asarray(load)) > max_delay_ms / 1e3)
 
     def _gain(self, hz: F64, load: float) -> F64:
         """Return what a step of its rate gains each agent (N,), weighted, at the same load."""
@@ -205,6 +207,6 @@ class _Prediction:
 
     def _qoe(self, hz: F64, load: float) -> F64:
         """Return the QoE of each agent (N,), by its rate and the load of the air."""
-        delay_ms = self._elsewhere_ms + 1e3 * self._air_s / (1 - load)
+        delay_ms = self._other_delay_ms + 1e3 * self._air_s / (1 - load)
         growth = self._measured_hz / np.maximum(hz, 1e-3) - 1  # a random walk between keyframes
         return self._terms.qoe(delay_ms, np.sqrt(self._error_cm**2 + self._drift_cm**2 * growth))

@@ -32,7 +32,7 @@ class RoomController:
         self._cut: dict[str, tuple[float, int]] = {}  # rates that were cut, and since when they may rise
         self._start = StaggeredStart()
         self._starting: dict[str, int] = {}  # agents whose air is not known, and when they joined
-        self._capacity, self._looked_ns = RoomCapacity(), 0
+        self._capacity, self._assessed_ns = RoomCapacity(), 0
 
     def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
         """Return what an agent may send whose air is not known: its part of what all that begin have."""
@@ -76,13 +76,13 @@ class RoomController:
             return self.first_grant(terms.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]
-        self._look_at_capacity(now_ns)
+        self._reassess_capacity(now_ns)
         if counts[0] < _SLOW_START_KEYFRAMES:
             return self.first_grant(terms.form, now_ns)
         self._starting.pop(name, None)
         if not self._is_short or name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
             self._allocate(now_ns)
-        return self._risen(name, self._grants[name], now_ns)
+        return self._limit_rise(name, self._grants[name], now_ns)
 
     def _allocate(self, now_ns: int) -> None:
         """Allot the air anew. What it takes a little more or less changes nothing: once the air is short it
@@ -99,7 +99,7 @@ class RoomController:
             for name, grant in most.items()
         }
 
-    def _risen(self, name: str, grant: RateGrant, now_ns: int) -> RateGrant:
+    def _limit_rise(self, name: str, grant: RateGrant, now_ns: int) -> RateGrant:
         """Return the grant, of which a rate that was cut rises slowly: others rise as well."""
         if self._is_short and name not in self._cut:
             self._cut[name] = grant.hz, now_ns
@@ -121,13 +121,13 @@ class RoomController:
         """Return the robots that have to leave for one more agent of a form, by name."""
         return self._recent_capacity(now_ns).displaced(form, now_ns)
 
-    def _look_at_capacity(self, now_ns: int) -> None:
-        if now_ns - self._looked_ns >= _PERIOD_NS:
-            self._capacity, self._looked_ns = self._capacity.looked_at(self._budget, now_ns), now_ns
+    def _reassess_capacity(self, now_ns: int) -> None:
+        if now_ns - self._assessed_ns >= _PERIOD_NS:
+            self._capacity, self._assessed_ns = self._capacity.reassess(self._budget, now_ns), now_ns
 
     def _recent_capacity(self, now_ns: int) -> RoomCapacity:
         """Return the capacity, a new one where nobody reports any more."""
-        return self._capacity if now_ns - self._looked_ns < seconds_to_ns(SILENT_S) else RoomCapacity()
+        return self._capacity if now_ns - self._assessed_ns < seconds_to_ns(SILENT_S) else RoomCapacity()
 
     def forget(self, name: str) -> None:
         """Drop an agent."""

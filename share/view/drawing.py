@@ -40,7 +40,7 @@ class Marks:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """An agent: T_room_body (4, 4). half_angles: as in `RunShown`. is_current: its pose is current."""
+    """An agent: T_room_body (4, 4). half_angles: as in `RunArrived`. is_current: its pose is current."""
 
     name: str
     label: str

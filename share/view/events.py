@@ -23,7 +23,7 @@ class SessionBegun:
 
 
 @dataclass(frozen=True, eq=False)
-class RunShown:
+class RunArrived:
     """A run of an agent. T_body_cam0 (4, 4). half_angles: tangents of half of cam0's horizontal and vertical
     field of view."""
 
@@ -35,7 +35,7 @@ class RunShown:
 
 
 @dataclass(frozen=True, eq=False)
-class KeyframeShown:
+class KeyframeArrived:
     """A keyframe. points (N, 3) float32 m, in the body. jpeg: cam0's image; empty without one."""
 
     key: KeyframeKey
@@ -46,7 +46,7 @@ class KeyframeShown:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseShown:
+class PoseArrived:
     """A run's newest pose (4, 4), relative to its keyframe `keyframe`; -1: in odom. age_ms: as in
     `PoseUpdate`; None: unknown."""
 
@@ -58,7 +58,7 @@ class PoseShown:
 
 
 @dataclass(frozen=True, eq=False)
-class CorrectionShown:
+class CorrectionArrived:
     """T_map_odom (4, 4) of a run's segment that holds the keyframe `segment_keyframe`."""
 
     run: str
@@ -120,10 +120,10 @@ class AgentsReported:
 
 RoomEvent = (
     SessionBegun
-    | RunShown
-    | KeyframeShown
-    | PoseShown
-    | CorrectionShown
+    | RunArrived
+    | KeyframeArrived
+    | PoseArrived
+    | CorrectionArrived
     | MapsSolved
     | LoopAccepted
     | LoopsRemoved

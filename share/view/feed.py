@@ -58,7 +58,7 @@ class ViewFeed:
         self._report: ev.AgentsReported | None = None
         self._sent_stamps: dict[str, int] = {}
         self._rigs: dict[str, Rig] = {}
-        self._runs: dict[str, ev.RunShown] = {}
+        self._runs: dict[str, ev.RunArrived] = {}
         self._left_out_before = 0  # when runs were sent
         self.left_out = 0  # entries that were dropped
         self._wake = threading.Event()
@@ -71,14 +71,14 @@ class ViewFeed:
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         """Start with what a map file holds. known: its runs, which may come back."""
         self._rigs = {run.key: run.hello.rig for run in known}
-        self._runs = {run.key: _run_shown(run.key, run.hello) for run in known}
+        self._runs = {run.key: _run_event(run.key, run.hello) for run in known}
         self._add(ev.SessionBegun(map_file))
 
     def add_effect(self, effect: EdgeEffect) -> None:
         match effect:
             case AddRun():
                 self._rigs[effect.key] = effect.hello.rig
-                self._runs[effect.key] = _run_shown(effect.key, effect.hello)
+                self._runs[effect.key] = _run_event(effect.key, effect.hello)
                 self._add(self._runs[effect.key])
             case AddKeyframe() if (rig := self._rigs.get(effect.key)) is not None:
                 self._add(_Keyframe(effect.key, effect.keyframe, rig))
@@ -177,18 +177,18 @@ class ViewFeed:
         for run, pose in self._poses.items():
             if self._sent_stamps.get(run) != pose.stamp_ns:
                 self._sent_stamps[run] = pose.stamp_ns
-                yield ev.PoseShown(run, pose.state, pose.keyframe, pose.T_keyframe_body, pose.age_ms)
+                yield ev.PoseArrived(run, pose.state, pose.keyframe, pose.T_keyframe_body, pose.age_ms)
 
     def _events(self, entry: object) -> Iterator[ev.RoomEvent]:
         match entry:
             case _Keyframe():
-                yield sources.keyframe_shown(*entry)
+                yield sources.keyframe_event(*entry)
             case MapperResult():
                 for change in entry.changes:
-                    if (shown := sources.change_shown(change)) is not None:
+                    if (shown := sources.change_event(change)) is not None:
                         yield shown
                 for finding in entry.findings:
-                    if (correction := sources.finding_shown(finding)) is not None:
+                    if (correction := sources.correction_event(finding)) is not None:
                         yield correction
             case _ if isinstance(entry, ev.RoomEvent):
                 yield entry
@@ -200,8 +200,8 @@ def batched(events: Iterator[ev.RoomEvent]) -> Iterator[list[ev.RoomEvent]]:
         yield batch
 
 
-def _run_shown(run: str, hello: Hello) -> ev.RunShown:
-    return sources.run_shown(run, hello.name, hello.kind, hello.rig)
+def _run_event(run: str, hello: Hello) -> ev.RunArrived:
+    return sources.run_event(run, hello.name, hello.kind, hello.rig)
 
 
 def _decision(fields: Mapping[str, Any]) -> ev.DecisionMade:

@@ -22,9 +22,9 @@ class Recap:
 
     def _begin(self, session: ev.SessionBegun) -> None:
         self._session = session
-        self._runs: dict[str, ev.RunShown] = {}
-        self._keyframes: dict[KeyframeKey, ev.KeyframeShown] = {}
-        self._corrections: dict[str, ev.CorrectionShown] = {}
+        self._runs: dict[str, ev.RunArrived] = {}
+        self._keyframes: dict[KeyframeKey, ev.KeyframeArrived] = {}
+        self._corrections: dict[str, ev.CorrectionArrived] = {}
         self._solved: ev.MapsSolved | None = None
         self._loops: dict[frozenset[KeyframeKey], ev.LoopAccepted] = {}
 
@@ -32,13 +32,13 @@ class Recap:
         match event:
             case ev.SessionBegun():
                 self._begin(event)
-            case ev.RunShown():
+            case ev.RunArrived():
                 self._runs[event.run] = event
-            case ev.KeyframeShown():
+            case ev.KeyframeArrived():
                 self._keyframes[event.key] = replace(event, jpeg=b"")
                 if len(self._keyframes) > MAX_KEYFRAMES:
                     del self._keyframes[next(iter(self._keyframes))]
-            case ev.CorrectionShown():
+            case ev.CorrectionArrived():
                 self._corrections[event.run] = event
             case ev.MapsSolved():
                 self._solved = event

@@ -33,7 +33,7 @@ def named(thing: dr.Lines | dr.Text, name: str) -> dr.Lines | dr.Text:
     return dr.Lines(name, thing.origin, thing.segments, thing.colour, thing.width)
 
 
-def frusta(T: F64, shown: ev.RunShown) -> F32:
+def frusta(T: F64, shown: ev.RunArrived) -> F32:
     """Return the edges (8 N, 2, 3) of N frusta of bodies T (N, 4, 4)."""
     size = _FRUSTUM_M * (1.0 if shown.kind is AgentKind.AR else 0.8)
     in_camera = np.vstack([np.zeros(3), np.column_stack([_CORNERS * shown.half_angles, np.ones(4)]) * size])

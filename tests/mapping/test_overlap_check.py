@@ -185,7 +185,7 @@ def test_a_copy_is_told_on_another_day_where_most_differs() -> None:
     room.come(0, 12)
     assert room.propose(room.loops(range(0, 12, 3)))[-1].accepted
     assert len(room.come(12, 40)) == 1
-    assert room.atlas.renewal.take_gone() == []
+    assert room.atlas.renewal.take_outdated() == []
 
 
 def test_keyframes_that_show_what_is_gone_leave_the_map_after_probation() -> None:
@@ -195,8 +195,8 @@ def test_keyframes_that_show_what_is_gone_leave_the_map_after_probation() -> Non
     room.solve()
     room.come(12, 40)
     assert room.atlas._overlap_check.is_on_probation(1)
-    assert room.atlas.renewal.take_gone() == []
+    assert room.atlas.renewal.take_outdated() == []
     room.atlas._overlap_check._probations.clear()
     room.come(40, 60)
-    gone = room.atlas.renewal.take_gone()
-    assert gone and room.atlas.renewal.take_gone() == []
+    gone = room.atlas.renewal.take_outdated()
+    assert gone and room.atlas.renewal.take_outdated() == []

@@ -126,7 +126,7 @@ def test_idle_connections_make_no_thread_and_keep_nobody_out(served):
         assert threading.active_count() == threads
         with connected(served) as reader:
             assert gets_poses(served, reader)
-        assert len(served._door._waiting) <= 32
+        assert len(served._peer_connections._waiting) <= 32
 
 
 def test_too_many_readers_are_refused_before_they_are_served(served):
@@ -135,7 +135,7 @@ def test_too_many_readers_are_refused_before_they_are_served(served):
             stack.enter_context(connected(served))
         with pytest.raises(exceptions.InvalidStatus, match="503"):
             client.connect(f"ws://{served.host}", proxy=None)
-        assert served._door.open_count == MAX_READERS
+        assert served._peer_connections.open_count == MAX_READERS
     with connected(served) as reader:  # the places are free again
         assert gets_poses(served, reader)
 

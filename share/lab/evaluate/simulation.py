@@ -213,7 +213,7 @@ class Simulation:
 
     def _to_edge(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, self.now_ns):
-            self._edge_did(effect)
+            self._on_edge_effect(effect)
             match effect:
                 case ed.SendToPeer():
                     self._send_down(effect)
@@ -225,7 +225,7 @@ class Simulation:
                 case ed.WriteEvent():
                     self._on_record(effect.fields)
 
-    def _edge_did(self, effect: ed.EdgeEffect) -> None:
+    def _on_edge_effect(self, effect: ed.EdgeEffect) -> None:
         """An effect of the edge, for those who look on."""
 
     def _send_down(self, effect: ed.SendToPeer) -> None:
