@@ -37,7 +37,7 @@ _MOST_AT_ONCE = 32  # with keyframes of 30 kB, 1 MB
 _COLLECT_S = 0.03  # between messages; the viewer draws fifteen times a second
 
 
-class _Keyframe(NamedTuple):
+class _QueuedKeyframe(NamedTuple):
     run: str
     keyframe: Keyframe
     rig: Rig
@@ -81,7 +81,7 @@ class ViewFeed:
                 self._runs[effect.key] = _run_event(effect.key, effect.hello)
                 self._add(self._runs[effect.key])
             case AddKeyframe() if (rig := self._rigs.get(effect.key)) is not None:
-                self._add(_Keyframe(effect.key, effect.keyframe, rig))
+                self._add(_QueuedKeyframe(effect.key, effect.keyframe, rig))
             case DropRun():
                 for known in (self._rigs, self._runs, self._sent_stamps):
                     known.pop(effect.key, None)
@@ -181,7 +181,7 @@ class ViewFeed:
 
     def _events(self, entry: object) -> Iterator[ev.RoomEvent]:
         match entry:
-            case _Keyframe():
+            case _QueuedKeyframe():
                 yield sources.keyframe_event(*entry)
             case MapperResult():
                 for change in entry.changes:
