@@ -14,7 +14,7 @@ import click
 from share.cli import options
 from share.cli.live_pages import RunScreen
 from share.cli.terminal import Column, LiveLine, Stages, column_table
-from share.config import STREAMED
+from share.config import BASE_POLICY, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from share.lab.evaluate.scoring import SessionScore
     from share.metrics.ate import Ate
     from share.recordings.session import Session
-
-_BASE_POLICY = "covins-g"  # that --compare compares with
 
 
 class _Seconds(click.FloatRange):
@@ -82,8 +80,8 @@ def demo(
     """
     config = options.load_config(config_file, [policy])  # checked before the room is made
     policy = config.edge.policy
-    if is_compared and policy in (_BASE_POLICY, STREAMED):
-        raise UsageError(f"--compare plays {_BASE_POLICY} and another policy; choose another than {policy}")
+    if is_compared and policy in (BASE_POLICY, STREAMED):
+        raise UsageError(f"--compare plays {BASE_POLICY} and another policy; choose another than {policy}")
     if policy == STREAMED and true_error:
         raise UsageError(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
@@ -181,7 +179,7 @@ def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_
     from share.lab.evaluate.trial import run_trial
 
     scored, live = [], LiveLine()
-    for policy in (_BASE_POLICY, terms.policy):
+    for policy in (BASE_POLICY, terms.policy):
         played, folder = replace(terms, policy=policy), out / policy
         _remove_trial(folder)
 

@@ -19,6 +19,7 @@ from share.odometry.state import FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import field_mask
+from share.vision.depth import MIN_RHO
 from share.vision.keyframe_images import Surfaces
 from share.vision.orb import measures_depth
 
@@ -32,7 +33,7 @@ _CAUTION_FRAMES = 60  # frames of it after the last such frame
 _PROBATION_S = 0.34  # after which a static feature is proven
 _UNPROVEN_NOISE_SCALE = 5.0  # of an unproven feature's sigma, in a time of caution
 _SLANT_PERIOD = 4  # frames between updates of a feature's slant
-_MIN_RHO, _MIN_DEPTH_M = 0.03, 0.2  # 1/m; m
+_MIN_DEPTH_M = 0.2
 _UNKNOWN_RHO_SIGMA = 0.05  # 1/m; half a pixel a frame at walking speed
 _KNOWN_DEPTH_RATIO = 0.1  # relative sigma of a known inverse depth
 _MIN_PLANE_OFFSET = 0.05  # share of the distance to a surface's plane that is left: nearer is seen edge on
@@ -139,7 +140,7 @@ class LandmarkMap:
         """Return the depths (N,) m of the features in cam0."""
         s = self.state
         T = feature_matching.anchors_in_camera(s)
-        z = (T[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _MIN_RHO) + T[:, 2, 3]
+        z = (T[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, MIN_RHO) + T[:, 2, 3]
         out: F64 = np.maximum(z, _MIN_DEPTH_M)
         return out
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.se3 import compose_cov, inverse, position_sigma
+from share.mapping.localisation_gate import AHEAD_M
 from share.metrics.local_error import WINDOW_S
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import LedgerEntry
@@ -18,7 +19,6 @@ from share.timing import SECOND_NS, seconds_to_ns
 from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
 
-_AHEAD_M = 3.0  # what a wearer looks at; a rotation moves it by this lever
 # The body and what is so far ahead move by at most this speed relative to odometry: 1 mm a frame at 15 Hz;
 # faster, but less than 3 mm, where the way is long.
 _SPEED_M_S, _LONG_MOTION_S, _MAX_SPEED_M_S = 0.0148, 10.0, 0.044
@@ -110,7 +110,7 @@ def _body_motion(T_old: F64, T_new: F64, T_odom_body: F64) -> F64:
 
 def _length_m(xi: F64) -> float:
     """Return how far a motion (6,) of the body moves the body and what is ahead of it, at most."""
-    return float(np.linalg.norm(xi[3:]) + _AHEAD_M * np.linalg.norm(xi[:3]))
+    return float(np.linalg.norm(xi[3:]) + AHEAD_M * np.linalg.norm(xi[:3]))
 
 
 _MAX_SETTLED = 1000

@@ -33,7 +33,7 @@ POSE_COST = 0.017  # of a keyframe: air that a pose takes at 5 to 8 Mbit/s
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
 MAX_LOAD = 0.95  # beyond, the formula has no meaning
-_STEP_HZ = 0.25
+STEP_HZ = 0.25  # in which rates are allocated, and rise again
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
 _LEAST_AIR_S = 1e-3
@@ -123,11 +123,11 @@ class RoomBudget:
 
     def is_short(self, max_delay_ms: float = ACCEPTED_DELAY_MS) -> bool:
         """Whether not everyone can send what it wants with less than `max_delay_ms` on the air."""
-        return _Prediction(self, is_thinned=False).exceeds_delay(max_delay_ms)
+        return _RatePrediction(self, is_thinned=False).exceeds_delay(max_delay_ms)
 
     def allocate(self, max_delay_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
         """Return what every agent may send where the air is short."""
-        rates = _Prediction(self, is_thinned=True).allocate(max_delay_ms)
+        rates = _RatePrediction(self, is_thinned=True).allocate(max_delay_ms)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
@@ -141,7 +141,7 @@ def scarce_grant(form: AgentKind, hz: float) -> RateGrant:
     return RateGrant(hz, SCARCE_POSE_HZ[form])
 
 
-class _Prediction:
+class _RatePrediction:
     """Predicts the QoE of all agents by their rates (N,), in the budget's order. is_thinned: with fewer
     poses."""
 
@@ -173,19 +173,17 @@ class _Prediction:
         who comes first before those of others."""
         hz = self._least_hz.copy()
         while len(hz) and (load := self._load(hz)) < MAX_LOAD:
-            is_open = hz + _STEP_HZ <= self._wanted_hz
+            is_open = hz + STEP_HZ <= self._wanted_hz
             gain = self._gain(hz, load) / np.maximum(self._air_s, 1e-6)
-            is_free = is_open & ~self._exceeds_delay(
-                self._capped(load + _STEP_HZ * self._air_s), max_delay_ms
-            )
+            is_free = is_open & ~self._exceeds_delay(self._capped(load + STEP_HZ * self._air_s), max_delay_ms)
             steps = is_free & self._has_priority
             if not steps.any():
                 steps = is_free
             if not steps.any():
-                steps = is_open & self._has_priority & (gain > _STEP_HZ * self._cost(hz, load))
+                steps = is_open & self._has_priority & (gain > STEP_HZ * self._cost(hz, load))
             if not steps.any():
                 break
-            hz[np.argmax(np.where(steps, gain, -np.inf))] += _STEP_HZ
+            hz[np.argmax(np.where(steps, gain, -np.inf))] += STEP_HZ
         return dict(zip(self._names, hz.tolist(), strict=True))
 
     def _load(self, hz: F64) -> float:
@@ -199,7 +197,7 @@ class _Prediction:
 
     def _gain(self, hz: F64, load: float) -> F64:
         """Return what a step of its rate gains each agent (N,), weighted, at the same load."""
-        return self._weight * (self._qoe(hz + _STEP_HZ, load) - self._qoe(hz, load))
+        return self._weight * (self._qoe(hz + STEP_HZ, load) - self._qoe(hz, load))
 
     def _cost(self, hz: F64, load: float) -> float:
         """Return the QoE, weighted, that all agents together lose by a load of one more."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters
-from share.scheduling.room_budget import SILENT_S, AgentAir, RateGrant, RoomBudget, first_grant
+from share.scheduling.room_budget import SILENT_S, STEP_HZ, AgentAir, RateGrant, RoomBudget, first_grant
 from share.scheduling.room_capacity import RoomCapacity
 from share.scheduling.staggered_start import UNKNOWN_KEYFRAME_S, StaggeredStart
 from share.timing import seconds_to_ns
@@ -17,7 +17,6 @@ _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 _STARTING_NS = 10_000_000_000  # after this time an agent without keyframes no longer reserves a share
 _STARTING_LOAD = 0.5  # of the air, for all that begin
 _PLENTY = 0.75  # of what is noticed: less, and the air is no longer short
-_STEP_HZ = 0.25  # rise per period of a rate that was reduced
 
 
 class RoomController:
@@ -106,7 +105,7 @@ class RoomController:
         if (cut := self._cut.get(name)) is None:
             return grant
         before_hz, since_ns = cut
-        hz = min(grant.hz, before_hz + _STEP_HZ * int((now_ns - since_ns) / _PERIOD_NS))
+        hz = min(grant.hz, before_hz + STEP_HZ * int((now_ns - since_ns) / _PERIOD_NS))
         if hz != before_hz or hz >= grant.hz:
             self._cut[name] = hz, now_ns
         if not self._is_short and hz >= grant.hz:

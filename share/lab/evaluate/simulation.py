@@ -19,7 +19,7 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
-from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import MS_NS, Delay, ProcessingDelays, Sampled
 from share.lab.evaluate.shared_air import SharedAir
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
@@ -41,7 +41,6 @@ from share.wire.codec import message_bytes
 from share.wire.layouts import Bytes
 from share.wire.messages import Hello, peer_id
 
-_MS = 1_000_000
 _TICK_MS = 50
 _RANDOM_BATCH = 1000
 _ACCESS_POINT = ""  # a station beside the agents, which go by name
@@ -95,9 +94,9 @@ class Simulation:
         self._delays, self._random_normals = delays, _random_normals(rng)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
-        self._members: dict[bytes, _SimulatedAgent] = {}
+        self._members: dict[bytes, _RoomMember] = {}
         for hello, frames, network in agents:
-            member = _SimulatedAgent(hello, Agent(hello, config), frames, network, rng.spawn(2))
+            member = _RoomMember(hello, Agent(hello, config), frames, network, rng.spawn(2))
             self._members[member.peer] = member
             self._schedule_next_frame(member)
         self.airs: dict[NetworkModel, SharedAir] = {}  # of the access points
@@ -138,15 +137,15 @@ class Simulation:
         for member in self._members.values():
             self._to_agent(member, ev.AgentTick())
         self._to_edge(ed.EdgeTick())
-        self._schedule(_TICK_MS * _MS, self._tick)
+        self._schedule(_TICK_MS * MS_NS, self._tick)
 
     # Agents.
 
-    def _schedule_next_frame(self, member: _SimulatedAgent) -> None:
+    def _schedule_next_frame(self, member: _RoomMember) -> None:
         if (frame := next(member.incoming, None)) is not None:
             self._schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
 
-    def _frame_arrived(self, member: _SimulatedAgent, tracked: TrackedFrame) -> None:
+    def _frame_arrived(self, member: _RoomMember, tracked: TrackedFrame) -> None:
         """Schedule the results of a frame, which waits until earlier frames are done, as in the agent's
         tracking thread."""
         begin_ns = max(self.now_ns, member.busy_until_ns)
@@ -172,7 +171,7 @@ class Simulation:
         member.busy_until_ns += self._draw(self._delays.finish_keyframe)
         self._schedule_next_frame(member)
 
-    def _to_agent(self, member: _SimulatedAgent, event: ev.AgentEvent) -> None:
+    def _to_agent(self, member: _RoomMember, event: ev.AgentEvent) -> None:
         log = self.logs[member.name]
         for effect in member.machine.handle(event, self.now_ns):
             self._on_effect(member.name, effect)
@@ -189,7 +188,7 @@ class Simulation:
                     if effect.stamp_ns is not None and effect.corrected_ms is not None:
                         log.add_correction(effect.stamp_ns, effect.corrected_ms)
 
-    def _send_up(self, member: _SimulatedAgent, frames: Sequence[Bytes]) -> None:
+    def _send_up(self, member: _RoomMember, frames: Sequence[Bytes]) -> None:
         size = message_bytes(frames)
 
         def on_air_done() -> None:
@@ -200,9 +199,7 @@ class Simulation:
 
         self._over_the_air(member, member.name, size, on_air_done)
 
-    def _over_the_air(
-        self, member: _SimulatedAgent, station: str, size: int, done: Callable[[], None]
-    ) -> None:
+    def _over_the_air(self, member: _RoomMember, station: str, size: int, done: Callable[[], None]) -> None:
         """Call `done` when a message has passed the shared air of this member, at once without one."""
         if (air := self.airs.get(member.network)) is None:
             done()
@@ -338,7 +335,7 @@ def _result_or_error(action: Callable[[], object]) -> object:
         return error
 
 
-class _SimulatedAgent:
+class _RoomMember:
     """An agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all frames that
     arrived so far."""
 
