@@ -1,5 +1,7 @@
-"""Objects that a viewer draws, and how lines and frusta are made. An object replaces an earlier one of the same
-name."""
+"""Objects that a viewer draws, and how lines and frusta are made.
+
+An object replaces an earlier one of the same name.
+"""
 
 from __future__ import annotations
 

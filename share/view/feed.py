@@ -24,7 +24,7 @@ from share.protocol.peer import RestoredRun
 from share.types import Keyframe
 from share.view import events as ev
 from share.view import sources
-from share.view.recap import Recap
+from share.view.events import Recap
 from share.wire.messages import Hello, PoseUpdate
 
 MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB

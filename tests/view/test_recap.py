@@ -9,7 +9,7 @@ from share.mapping.map_changes import SavePoses
 from share.types import AgentKind
 from share.view import drawing as dr
 from share.view import events as ev
-from share.view.recap import MAX_KEYFRAMES, Recap
+from share.view.events import MAX_KEYFRAMES, Recap
 from share.view.room import Room
 
 
