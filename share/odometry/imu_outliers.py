@@ -163,8 +163,7 @@ class ImuOutlierDetector:
         return None if accepted.all() else accepted
 
     def _accept_all(self, stamps_ns: I64, values: F64) -> bool:
-        """Accept the samples if no step between them is too large, which is the common case. Return whether
-        they are accepted."""
+        """Accept the samples if no step is too large, which is the common case. Return whether they are."""
         if self._run_start_ns is not None or self._newest is None:
             return False
         steps = np.empty_like(values)
@@ -191,9 +190,8 @@ class ImuOutlierDetector:
             self._restart_window = _RestartWindow(None)
         elif stamp_ns - self._newest[0] > _MAX_GAP_NS:
             is_gap = 0 < self._step_ns <= _MAX_GAP_NS  # else samples are always this far apart
-            self._restart_window = _RestartWindow(
-                (self._accepted_ns, self._accepted_value) if is_gap else None
-            )
+            before = (self._accepted_ns, self._accepted_value) if is_gap else None
+            self._restart_window = _RestartWindow(before)
 
     def inflation(self, from_ns: int, to_ns: int) -> ImuInflation | None:
         """Return the inflation for rejected or suspect samples in [from_ns, to_ns); None without any."""

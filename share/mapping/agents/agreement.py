@@ -51,7 +51,7 @@ class AgentStanding:
     sigma: float | None = None
     put_right: float = 0.0
     nis: float | None = None
-    worst_contradiction: float = 0.0
+    doubt: float = 0.0
     widened: float = 1.0
 
     @property
