@@ -126,8 +126,8 @@ def test_keyframes_that_show_what_is_gone_are_removed_with_the_next_one(tmp_path
     assert not {*removed} & atlas.graph.poses.keys()
     changes = [change for change in second.changes if isinstance(change, RemoveKeyframes)]
     assert {key for change in changes for key in change.keys} == {*keys}
-    assert atlas._overlap_check.is_earlier(7)
-    assert not atlas._overlap_check.is_earlier(max(atlas.graph.poses))
+    assert atlas.overlap_check.is_earlier(7)
+    assert not atlas.overlap_check.is_earlier(max(atlas.graph.poses))
 
 
 @pytest.mark.long

@@ -421,7 +421,7 @@ def test_while_queries_wait_fewer_candidates_are_tried(monkeypatch):
         keyframes = both.keyframes("ann")
         for keyframe in keyframes[: 28 - waiting]:
             mapper.add_keyframe("ann-000b", keyframe)
-        while mapper._queries.next_query() is not None:
+        while mapper.queries.next_query() is not None:
             pass
         for keyframe in keyframes[28 - waiting : 29]:  # the last is compared by its looks
             mapper.add_keyframe("ann-000b", keyframe)

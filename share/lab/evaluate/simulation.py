@@ -274,7 +274,7 @@ class Simulation:
             self._schedule(spent_ns, self._mapper_idle)
             return
         result = _result_or_error(step.run)
-        step_ns = self._draw(self._delay_of(step, result))
+        step_ns = self._draw(self.delay_of(step, result))
         self.mapper_busy_ns += step_ns
         self._schedule(spent_ns + step_ns, lambda: self._step_done(step, result))
 
@@ -297,7 +297,7 @@ class Simulation:
                 after_ns + solve_ns, lambda: self._send_to_mapper(self._delays.apply_solution, apply_result)
             )
 
-    def _delay_of(self, step: Any, result: object) -> Delay:
+    def delay_of(self, step: Any, result: object) -> Delay:
         delays = self._delays
         if step.kind == QueryStep.kind:
             return delays.query
