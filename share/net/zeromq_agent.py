@@ -24,7 +24,7 @@ from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 from share.wire.messages import peer_id
 
 _BACKLOG_CHECK_MS = 20  # how often the data that wait are checked
-_FLOOD_TROUBLE_S = 10.0  # after so long a connection, an edge's flood is forgiven
+_FLOOD_TROUBLE_S = 10.0  # connected for so long, the link no longer reports an edge's flood as trouble
 _RECONNECT_S = 1.0  # after a failed handshake or connection; libzmq itself gives up after a ZMTP error
 _HANDSHAKE_EVENTS = (
     zmq.EVENT_CONNECTED

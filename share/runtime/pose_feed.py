@@ -181,7 +181,7 @@ _MAX_WAITING = 32  # connections that are not served yet
 _BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
 _CLOSE_S = 1.0
 _SEND_S = 5.0  # after that a reader that does not read is disconnected
-_LOOK_S = 1.0  # between looks for readers that have gone, where there is no news
+_LOOK_S = 1.0  # between checks for readers that have gone, while there is no message
 _UNSENT_BYTES = 4096  # of a reader that does not read; newer messages are left out
 _SLEEP_RATIO = 9.0  # the server's thread uses at most a tenth of a core
 

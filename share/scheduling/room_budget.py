@@ -122,7 +122,7 @@ class RoomBudget:
         return None if not times else median(times) if len(times) > 2 else min(times)
 
     def is_short(self, max_delay_ms: float = ACCEPTED_DELAY_MS) -> bool:
-        """Whether not everyone can send what it wants with less than `max_delay_ms` on the air."""
+        """Return whether keyframes at all wanted rates take longer than `max_delay_ms` on the air."""
         return _RatePrediction(self, is_thinned=False).exceeds_delay(max_delay_ms)
 
     def allocate(self, max_delay_ms: float = ACCEPTED_DELAY_MS) -> dict[str, RateGrant]:
@@ -165,12 +165,12 @@ class _RatePrediction:
         self._measured_hz = np.maximum([agent.hz for agent in agents], 1e-3)
 
     def exceeds_delay(self, max_delay_ms: float) -> bool:
-        """Return whether keyframes at the wanted rates take longer on the air than a wearer notices."""
+        """Return whether keyframes at the wanted rates take longer than `max_delay_ms` on the air."""
         return bool(self._exceeds_delay(self._load(self._wanted_hz), max_delay_ms))
 
     def allocate(self, max_delay_ms: float) -> dict[str, float]:
-        """Return the rates, Hz: least ones, then steps to whom they gain most; while nobody notices, those of
-        who comes first before those of others."""
+        """Return the rates, Hz: the least ones, then a step at a time to the agent that gains most by it.
+        Below `max_delay_ms`, agents with priority come before others."""
         hz = self._least_hz.copy()
         while len(hz) and (load := self._load(hz)) < MAX_LOAD:
             is_open = hz + STEP_HZ <= self._wanted_hz

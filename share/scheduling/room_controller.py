@@ -148,7 +148,7 @@ class RoomController:
             self._capacity, self._assessed_ns = self._capacity.reassess(self._budget, now_ns), now_ns
 
     def _recent_capacity(self, now_ns: int) -> RoomCapacity:
-        """Return the capacity, a new one where nobody reports any more."""
+        """Return the capacity; an empty one once no agent reports any more."""
         return self._capacity if now_ns - self._assessed_ns < seconds_to_ns(SILENT_S) else RoomCapacity()
 
     def forget(self, name: str) -> None:

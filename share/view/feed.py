@@ -118,7 +118,7 @@ class ViewFeed:
         self._add(event)
 
     def reconnect(self, connection: Connection) -> None:
-        """Go on with another viewer, which is told first what there is."""
+        """Continue with another viewer, which first receives a recap."""
         self._next_connection = connection
         self._wake.set()
 
@@ -153,7 +153,7 @@ class ViewFeed:
         self._send(END)
 
     def _send(self, events: list[ev.RoomEvent] | bytes) -> None:
-        """Send events, or the end as it is; make nothing of them where nobody receives."""
+        """Send events, or the end as it is; skip the work while there is no receiver."""
         if self._connection is not None:
             data = events if isinstance(events, bytes) else pickle.dumps(events, pickle.HIGHEST_PROTOCOL)
             try:

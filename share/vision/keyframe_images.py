@@ -100,7 +100,7 @@ _redirecting = threading.Lock()  # file descriptors belong to the whole process
 
 
 def capture_decoder_warnings(decode: Callable[[], T]) -> tuple[T, str]:
-    """Return `decode()` and what it wrote to the process's stderr, which nobody else sees.
+    """Return `decode()` and what it wrote to the process's stderr, which is not shown.
 
     Other threads' lines of that moment count as its own: for a process whose other threads write none."""
     with _redirecting:

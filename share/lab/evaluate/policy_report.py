@@ -153,7 +153,7 @@ def _win_counts(runs: Sequence[RunMetrics], name: str, other: str) -> str:
 
 
 def _agent_table(runs: Sequence[RunMetrics], names: Sequence[str], field: str) -> str:
-    """Return a table of one quantity, a row for each agent on each session; "" where nobody has it."""
+    """Return a table of one quantity, a row for each agent on each session; "" where no run has it."""
     rows = [["session", "agent", *names]]
     for session in dict.fromkeys(run.conditions.session for run in runs):
         for agent in dict.fromkeys(

@@ -223,7 +223,7 @@ class Simulation:
                     self._on_record(effect.fields)
 
     def _on_edge_effect(self, effect: ed.EdgeEffect) -> None:
-        """An effect of the edge, for those who look on."""
+        """Hook for observers of the edge's effects."""
 
     def _send_down(self, effect: ed.SendToPeer) -> None:
         member, frames = self._members[effect.peer_id], effect.frames

@@ -13,7 +13,7 @@ import numpy as np
 from share.geometry import se3
 from share.types import F64, Keyframe
 
-_UPRIGHT_STEP_RAD = np.radians(0.001)  # by which a solution turns a map upright: nobody in it notices
+_UPRIGHT_STEP_RAD = np.radians(0.001)  # by which a solution turns a map upright: imperceptible
 _FLOOR_DEG = 0.1  # added to sigma in quadrature: error of the IMU calibration
 
 
