@@ -122,11 +122,12 @@ class MergeConfig:
         _require_positive(self, "join_places")
 
 
+BASE_POLICY = "covins-g"  # to which the others are compared
 STREAMED = "streamed"
 POLICY_NAMES = (
     "share",
     "share-paper",
-    "covins-g",
+    BASE_POLICY,
     "linear",
     "equal",
     "random",

@@ -56,7 +56,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "sequencer.gap_factor": "sensors.stamps.GAP_FACTOR",
     "sequencer.max_jump_s": "sensors.stamps.MAX_JUMP_S",
     # place
-    "place.enough": "mapping.query_queue.ENOUGH_VERIFIED",
+    "place.enough": "mapping.query_queue.MAX_VERIFIED",
     "place.tables": "mapping.recognition.index.TABLES",
     "place.hash_bits": "mapping.recognition.index.HASH_BITS",
     "place.index_seed": "mapping.recognition.index.SEED",
@@ -117,8 +117,8 @@ RETIRED_SETTINGS: dict[str, str] = {
     # edge
     "edge.name_hold_s": "protocol.admission.NAME_HOLD_S",
     "edge.each_waiting": "mapping.query_queue.MAX_WAITING_EACH",
-    "edge.hurry_waiting": "mapping.query_queue.HURRY_WAITING",
-    "edge.hurry_candidates": "mapping.query_queue.HURRY_CANDIDATES",
+    "edge.hurry_waiting": "mapping.query_queue.MIN_BACKLOG",
+    "edge.hurry_candidates": "mapping.query_queue.MAX_BACKLOG_CANDIDATES",
     # control
     "control.alpha": "scheduling.policies.DERIVATIVE_WEIGHT",
     "control.near_m": "config.NEAR_M",

@@ -37,7 +37,7 @@ from websockets.sync.client import connect  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.lab.emulate.recipe import demo_recipe, meeting_seed  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
-from share.lab.evaluate.shown_simulation import shown_simulation  # noqa: E402
+from share.lab.evaluate.observed_simulation import observed_simulation  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.view.viewer import LiveRoom  # noqa: E402
 
@@ -121,7 +121,7 @@ def _devtools_port(profile: Path) -> int:
 def pictures(session: Session, seconds: float, hz: float, width: int, height: int) -> list[bytes]:
     """Return pictures (PNG) of a session from its start to its end."""
     with closing(LiveRoom("0", None, "SHARE edge")) as live:
-        room = shown_simulation(session, Config(), live.feed)
+        room = observed_simulation(session, Config(), live.feed)
         with browser_page(f"http://{live.endpoint}/", width, height) as page:
             time.sleep(8.0)
             page.evaluate(_WITHOUT_NOTES)

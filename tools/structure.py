@@ -1,11 +1,11 @@
 """The size and shape of the house in figures, as Markdown or JSON.
 
-    python tools/structure.py [--json] [--trace SESSION]
+    python tools/structure.py [--json] [--list] [--trace SESSION]
 
 Lines, files and modules of product (`share` without `share.lab`) and laboratory, modules with a single
-importer, class names used twice, configuration keys, size of the pages. --trace: of a session with at least
-two agents, tracked and played in virtual time: how many packages, modules and functions one frame enters in
-the tracker, and one keyframe in the mapper (medians).
+importer, class names used twice, long functions, configuration keys, size of the pages. --trace: of a session
+with at least two agents, tracked and played in virtual time: how many packages, modules and functions one
+frame enters in the tracker, and one keyframe in the mapper (medians).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import json
 import statistics
 import sys
 import tempfile
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,15 +25,17 @@ from types import FrameType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+LONG_FUNCTION = 40  # lines
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--list", action="store_true", help="name what is counted, one a line")
     parser.add_argument("--trace", type=Path, metavar="SESSION")
     options = parser.parse_args()
     sys.path.insert(0, str(ROOT))
-    figures = count_tree() | ({} if options.trace is None else trace(options.trace))
+    figures = count_tree(options.list) | ({} if options.trace is None else trace(options.trace))
     if options.json:
         print(json.dumps(figures, indent=2))
     else:
@@ -44,7 +46,7 @@ def main() -> None:
         )
 
 
-def count_tree() -> dict[str, int]:
+def count_tree(listed: bool) -> dict[str, int]:
     modules = {module_name(path): path for path in sorted((ROOT / "share").rglob("*.py"))}
     trees = {name: ast.parse(path.read_text()) for name, path in modules.items()}
     lines = {
@@ -56,10 +58,17 @@ def count_tree() -> dict[str, int]:
     for name, tree in trees.items():
         for target in imported(tree, modules.keys()):
             importers[target].add(name)
-    single = [name for name, names in importers.items() if len(names) == 1]
-    classes = Counter(
-        node.name for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef)
-    )
+    single = {name: names.pop() for name, names in importers.items() if len(names) == 1}
+    homonyms = {name: places for name, places in class_places(trees).items() if len(places) > 1}
+    long_functions = {
+        f"{name}.{node.name}": length
+        for name, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (length := (node.end_lineno or 0) - node.lineno + 1) > LONG_FUNCTION
+    }
+    if listed:
+        print_lists(lines, single, homonyms, long_functions)
     return {
         "product: lines": sum(n for name, n in lines.items() if name not in lab),
         "product: modules": sum(bool(n) for name, n in lines.items() if name not in lab),
@@ -68,12 +77,38 @@ def count_tree() -> dict[str, int]:
         "modules over 400 lines": sum(n > 400 for n in lines.values()),
         "modules with one importer": len(single),
         "... of fewer than 60 lines": sum(lines[name] < 60 for name in single),
-        "class names used twice or more": sum(n > 1 for n in classes.values()),
+        "class names used twice or more": len(homonyms),
+        f"functions over {LONG_FUNCTION} lines": len(long_functions),
         "configuration keys": configuration_keys(),
         "pages: kB": sum(path.stat().st_size for path in (ROOT / "docs").rglob("*.md")) // 1000,
         "tests: lines": sum(len(p.read_text().splitlines()) for p in (ROOT / "tests").rglob("*.py")),
         "tools: lines": sum(len(p.read_text().splitlines()) for p in (ROOT / "tools").rglob("*.py")),
     }
+
+
+def class_places(trees: dict[str, ast.Module]) -> dict[str, list[str]]:
+    """Return the modules that define a class of each name; a leading _ does not make it another name."""
+    out = defaultdict(list)
+    for name, tree in trees.items():
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef):
+                out[node.name.lstrip("_")].append(name)
+    return out
+
+
+def print_lists(
+    lines: dict[str, int],
+    single: dict[str, str],
+    homonyms: dict[str, list[str]],
+    long_functions: dict[str, int],
+) -> None:
+    for name in sorted(single, key=lambda name: lines[name]):
+        print(f"one importer, {lines[name]} lines: {name} <- {single[name]}")
+    for name, places in homonyms.items():
+        print(f"class {name}: {', '.join(places)}")
+    for name, length in sorted(long_functions.items(), key=lambda item: -item[1]):
+        print(f"{length} lines: {name}")
+    print()
 
 
 def is_docstring_only(tree: ast.Module) -> bool:

@@ -15,6 +15,7 @@ from share.errors import DataError, ShareError
 if TYPE_CHECKING:
     from share.lab.calibrate.board_views import BoardImages
     from share.lab.calibrate.camera_report import CameraCalibration
+    from share.lab.calibrate.corner_observations import BoardView
     from share.lab.calibrate.target import Target
 
 
@@ -97,33 +98,49 @@ def camera(
         raise ShareError(f"{source}: {failure_message(chain, outcome.verdict.reasons)}")
 
 
+def _find_board(
+    source: str,
+    pictures: BoardImages,
+    target: Target,
+    every: int,
+    is_fisheye: bool,
+    workers: int,
+    stages: Stages,
+) -> tuple[list[BoardView], list[tuple[int, int]]]:
+    """Return the views with enough of the board, and the image size of each camera. Raises DataError where
+    there is none, or the sizes differ."""
+    from share.lab.calibrate.board_views import find_views
+    from share.lab.calibrate.camera_initialisation import has_enough_corners
+
+    progress = partial(stages, "looking for the board")
+    views, sizes = find_views(pictures, target, every, progress, workers, is_fisheye)
+    if len(set(sizes)) > 1:
+        raise DataError(
+            f"{source}: the cameras have images of different sizes, {sizes[0]} and {sizes[1]}; calibrate "
+            "one with --camera cam0"
+        )
+    with_target = [
+        view
+        for view in views
+        if any(has_enough_corners(target.corners[one.ids, :2]) for one in view.detections)
+    ]
+    if not with_target:
+        raise DataError(
+            f"{source}: no board found in {len(views)} images; check that --target is the board shown"
+        )
+    return with_target, sizes
+
+
 def _calibrate(
     source: str, pictures: BoardImages, target: Target, every: int, max_views: int, model: str, workers: int
 ) -> CameraCalibration:
-    from share.lab.calibrate.board_views import find_views
     from share.lab.calibrate.camera_bundle import calibrate_cameras
-    from share.lab.calibrate.camera_initialisation import has_enough_corners
     from share.lab.calibrate.camera_report import CameraCalibration
     from share.lab.calibrate.camera_verdict import choose_views, coverage, judge_cameras, median_epipolar_px
 
     with Stages() as stages:
-        views, sizes = find_views(
-            pictures, target, every, partial(stages, "looking for the board"), workers, model == "equidistant"
-        )
-        if len(set(sizes)) > 1:
-            raise DataError(
-                f"{source}: the cameras have images of different sizes, {sizes[0]} and {sizes[1]}; calibrate "
-                "one with --camera cam0"
-            )
-        with_target = [
-            view
-            for view in views
-            if any(has_enough_corners(target.corners[one.ids, :2]) for one in view.detections)
-        ]
-        if not with_target:
-            raise DataError(
-                f"{source}: no board found in {len(views)} images; check that --target is the board shown"
-            )
+        is_fisheye = model == "equidistant"
+        with_target, sizes = _find_board(source, pictures, target, every, is_fisheye, workers, stages)
         used = [with_target[k] for k in choose_views(with_target, target, sizes[0], max_views)]
         stages("calibrating", 0, 1)
         try:

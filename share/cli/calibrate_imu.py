@@ -77,7 +77,8 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
 
 
 def _summary(characteristics: ImuCharacteristics, rows: list[NoiseRow], dropped: int) -> str:
-    from share.lab.calibrate.imu_report import STANDARD_GRAVITY, gravity_norm
+    from share.lab.calibrate.imu import STANDARD_GRAVITY
+    from share.lab.calibrate.imu_report import gravity_norm
 
     heads = [
         "",

@@ -14,7 +14,7 @@ import click
 from share.cli import options
 from share.cli.live_pages import RunScreen
 from share.cli.terminal import Column, LiveLine, Stages, column_table
-from share.config import STREAMED
+from share.config import BASE_POLICY, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from share.lab.evaluate.scoring import SessionScore
     from share.metrics.ate import Ate
     from share.recordings.session import Session
-
-_BASE_POLICY = "covins-g"  # that --compare compares with
 
 
 class _Seconds(click.FloatRange):
@@ -82,8 +80,8 @@ def demo(
     """
     config = options.load_config(config_file, [policy])  # checked before the room is made
     policy = config.edge.policy
-    if is_compared and policy in (_BASE_POLICY, STREAMED):
-        raise UsageError(f"--compare plays {_BASE_POLICY} and another policy; choose another than {policy}")
+    if is_compared and policy in (BASE_POLICY, STREAMED):
+        raise UsageError(f"--compare plays {BASE_POLICY} and another policy; choose another than {policy}")
     if policy == STREAMED and true_error:
         raise UsageError(
             "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
@@ -181,7 +179,7 @@ def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_
     from share.lab.evaluate.trial import run_trial
 
     scored, live = [], LiveLine()
-    for policy in (_BASE_POLICY, terms.policy):
+    for policy in (BASE_POLICY, terms.policy):
         played, folder = replace(terms, policy=policy), out / policy
         _remove_trial(folder)
 
@@ -231,29 +229,37 @@ def _renderable_scene(scene: str | None) -> str:
 def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool) -> str:
     """Return two tables, which an ordinary terminal is wide enough for: of errors and of times. since_s: when
     each agent came to share a map, s since the first one joined."""
+    tables = _error_columns(result, since_s), _time_columns(result)
+    text = "\n\n".join(column_table(columns, result.agents) for columns in tables)
+    return f"{text}\n\n{_untracked_text(result) if streamed else _joint_text(result)}"
+
+
+def _error_columns(result: SessionScore, since_s: dict[str, float]) -> tuple[Column, ...]:
     joint = {} if result.joint is None else result.joint.agents
 
     def coverage(ates: Mapping[str, Ate | None]) -> Column:
         """Return a column with the share of an agent's frames that its error is about."""
         return "of frames", lambda agent: _percent(ates.get(agent), result.agents[agent].report["frames"])
 
-    def duration(title: str, name: str, percentile: str) -> Column:
-        return title, lambda agent: _ms(result.agents[agent].report[name][percentile])
-
-    def count(name: str) -> Column:
-        return name, lambda agent: str(result.agents[agent].report[name])
-
-    name: Column = ("agent", str)
-    errors: tuple[Column, ...] = (
-        name,
+    return (
+        ("agent", str),
         ("odom ATE", lambda agent: _cm(result.agents[agent].odometry)),
         coverage({name: agent.odometry for name, agent in result.agents.items()}),
         ("in the map since", lambda agent: f"{since_s[agent]:.1f} s" if agent in since_s else "–"),
         ("map ATE", lambda agent: _cm(joint.get(agent))),
         coverage(joint),
     )
-    times: tuple[Column, ...] = (
-        name,
+
+
+def _time_columns(result: SessionScore) -> tuple[Column, ...]:
+    def duration(title: str, name: str, percentile: str) -> Column:
+        return title, lambda agent: _ms(result.agents[agent].report[name][percentile])
+
+    def count(name: str) -> Column:
+        return name, lambda agent: str(result.agents[agent].report[name])
+
+    return (
+        ("agent", str),
         duration("pose p50", "track_ms", "p50"),
         duration("p95", "track_ms", "p95"),
         ("> 20 ms", lambda agent: f"{100 * result.agents[agent].report['over_20ms']:.1f} %"),
@@ -261,18 +267,20 @@ def _score_table(result: SessionScore, since_s: dict[str, float], streamed: bool
         duration("p95", "corrected_ms", "p95"),
         *(count(name) for name in ("keyframes", "sent", "corrections")),
     )
-    table = "\n\n".join(column_table(columns, result.agents) for columns in (errors, times))
-    if streamed:
-        untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
-        note = f"the edge tracked each agent alone; frames without an answer: {untracked}"
-        return f"{table}\n\n{note}"
-    members = len(joint)
-    verdict = (
-        f"{members} of {len(result.agents)} agents in one map"
-        + (f", joint ATE {_cm(result.joint.joint)}" if result.joint else "")
-        + "  (causal poses, one SE3 alignment for all)"
+
+
+def _untracked_text(result: SessionScore) -> str:
+    untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
+    return f"the edge tracked each agent alone; frames without an answer: {untracked}"
+
+
+def _joint_text(result: SessionScore) -> str:
+    members = 0 if result.joint is None else len(result.joint.agents)
+    joint = "" if result.joint is None else f", joint ATE {_cm(result.joint.joint)}"
+    return (
+        f"{members} of {len(result.agents)} agents in one map{joint}"
+        "  (causal poses, one SE3 alignment for all)"
     )
-    return f"{table}\n\n{verdict}"
 
 
 def _cm(ate: Ate | None) -> str:

@@ -12,7 +12,7 @@ import click
 
 from share.cli import options
 from share.cli.terminal import LiveLine
-from share.config import POLICY_NAMES, STREAMED
+from share.config import BASE_POLICY, POLICY_NAMES, STREAMED
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from share.lab.evaluate.sweep import Axis, Point
     from share.lab.evaluate.trial import Trial
 
-BASE_POLICY = "covins-g"  # the policy to which the others are compared
 many_run_options = options.option_group(
     click.option("--seeds", type=click.IntRange(1), default=1, help="Number of seeds (0, 1, …), each a run."),
     click.option(

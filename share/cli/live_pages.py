@@ -28,7 +28,7 @@ class RunScreen:
 
         self._live = LiveLine()
         self._room: TerminalRoom | None = None
-        self._merges_said = 0
+        self._merges_printed = 0
         self._is_text, self._has_pages = may_draw and has_room(self._live), has_pages
         self._has_view = has_pages and is_installed()
         if has_pages and not self._has_view:
@@ -51,10 +51,10 @@ class RunScreen:
 
     def show(self, now: Progress) -> None:
         """Show how far the run is."""
-        for line in now.merges[self._merges_said :]:
+        for line in now.merges[self._merges_printed :]:
             if self._live.is_terminal:
                 self._live.print_line(line)
-        self._merges_said = len(now.merges)
+        self._merges_printed = len(now.merges)
         if self._room is None or not self._room.show(str(now)):
             self._live.write(str(now))
 

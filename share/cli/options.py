@@ -13,7 +13,7 @@ import click
 
 from share.cli.terminal import print_note
 from share.cli.verbosity import remember
-from share.config import POLICY_NAMES, STREAMED
+from share.config import BASE_POLICY, POLICY_NAMES, STREAMED
 from share.errors import UsageError, one_line
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ rotations = click.option(
 POLICY_TEXTS = {
     "share": "rate of each agent by its quality of experience; merges with a small gain are skipped",
     "share-paper": "the paper's algorithm to the letter: no budget of the room, low QoE raises the rate",
-    "covins-g": "every keyframe is sent, every verified loop is merged",
+    BASE_POLICY: "every keyframe is sent, every verified loop is merged",
     "linear": "rate falls with the delay; merges as share",
     "equal": "as share, robots rated like headsets",
     "random": "as share, with control gains drawn from control.random_seed",

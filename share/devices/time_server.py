@@ -17,7 +17,7 @@ RATE_PER_S = 8.0  # mean rate of requests per address
 BURST = 32  # requests at once per address; chronyd's iburst sends 4 to 8, every 2 s
 MAX_CLIENTS = 1024  # addresses remembered; the least recently used is forgotten
 _TICK_S = 0.2  # period of `show`; also how long `stop` may take
-_MAX_COMPLAINTS = 16  # kinds of errors that are reported
+_MAX_REPORTED_ERRORS = 16  # kinds of errors that are reported
 
 
 class TimeServer:
@@ -129,7 +129,7 @@ class TimeServerRun:
             self._notify_once(f"cannot send a reply to {to[0]}: {error.strerror or error}")
 
     def _notify_once(self, trouble: str) -> None:
-        """Report each error once, at most `_MAX_COMPLAINTS`: forged addresses may be many."""
-        if trouble not in self._notified and len(self._notified) < _MAX_COMPLAINTS:
+        """Report each error once, at most `_MAX_REPORTED_ERRORS`: forged addresses may be many."""
+        if trouble not in self._notified and len(self._notified) < _MAX_REPORTED_ERRORS:
             self._notified.add(trouble)
             self._notify(trouble)

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from share.files.reading import is_sparse, open_regular
 
-_STEPS_PER_CHECK = 10_000  # of SQLite's virtual machine, between two checks: some 0.1 ms
+STEPS_PER_CHECK = 10_000  # of SQLite's virtual machine, between two checks: some 0.1 ms
 _MIN_STEPS = 10**8  # allowed per query, whatever the file's size: seconds
 _STEPS_PER_BYTE = 100  # allowed more per byte of the file
 _CACHE_KB = 8000
@@ -60,7 +60,7 @@ class UntrustedDatabase:
         try:
             limit_untrusted(self._connection, max_row_bytes)
             self._connection.execute(f"PRAGMA cache_size = -{_CACHE_KB}")
-            self._connection.set_progress_handler(self._step, _STEPS_PER_CHECK)
+            self._connection.set_progress_handler(self._step, STEPS_PER_CHECK)
             for table, names in columns.items():
                 self._check_table(table, names)
         except BaseException:
@@ -76,7 +76,7 @@ class UntrustedDatabase:
         return self._connection.execute(query, values)
 
     def _step(self) -> bool:
-        self._steps += _STEPS_PER_CHECK
+        self._steps += STEPS_PER_CHECK
         return self._steps > self._max_steps
 
     def _check_table(self, table: str, names: tuple[str, ...]) -> None:

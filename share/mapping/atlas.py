@@ -45,9 +45,9 @@ class Atlas:
         """camera_views: by node id; the caller keeps them up to date."""
         known_views: Mapping[int, CameraView] = {} if camera_views is None else camera_views
         self.graph = MapGraph()
-        self._overlap_check = OverlapCheck(self.graph, known_views)
-        self.loop_acceptance = LoopAcceptance(config, self.graph, self._overlap_check)
-        self.renewal = MapRenewal(self.graph, known_views, self._overlap_check)
+        self.overlap_check = OverlapCheck(self.graph, known_views)
+        self.loop_acceptance = LoopAcceptance(config, self.graph, self.overlap_check)
+        self.renewal = MapRenewal(self.graph, known_views, self.overlap_check)
         self._localisation_gate = LocalisationGate(config.enter_m)
         self._runs = AgentRuns()
         self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self._runs)
@@ -182,7 +182,7 @@ class Atlas:
             node_ids.append(node_id)
         for loop in kept.loops:
             graph.add_loop(loop)
-        self._overlap_check.note_restored(max(node_ids, default=-1) + 1)
+        self.overlap_check.note_restored(max(node_ids, default=-1) + 1)
         self.quarantine.suspect_restored()
         for agent in set(agents):
             current = graph.odometry.current_segment(agent)

@@ -29,10 +29,10 @@ _ALIGN_SIGMA_RAD = float(np.radians(1.0))
 
 
 class CandidateChecks(NamedTuple):
-    """Candidates of one query, best first. by_map: to be aligned; by_looks: to be verified."""
+    """Candidates of one query, best first. by_map: to be aligned; by_appearance: to be verified."""
 
     by_map: list[int]
-    by_looks: list[int]
+    by_appearance: list[int]
 
 
 def choose_checks(

@@ -20,7 +20,7 @@ import numpy as np
 
 from share.mapping.loop_consistency import articulation_segments
 from share.mapping.map_graph import MapGraph
-from share.mapping.redundancy import InSlices, redundant, run_at_once
+from share.mapping.redundancy import InSlices, redundant, run_without_pause
 from share.mapping.segments import MIN_LOOP_GAP, AgentRuns
 
 _MARGIN = 1.05  # share of the most keyframes at which those to remove are chosen
@@ -82,7 +82,7 @@ class KeyframeCulling:
 
         If possible, absent runs keep their newest keyframes, and maps without a present agent keep something.
         """
-        return run_at_once(self._choose(count))
+        return run_without_pause(self._choose(count))
 
     def _choose(self, count: int) -> InSlices[list[int]]:
         chosen: list[int] = []

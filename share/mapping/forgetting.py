@@ -88,7 +88,7 @@ def plan_forgetting(
     """
     names = {run.run_key: run.hello.name for run in kept.runs}
 
-    def is_meant(stored: StoredKeyframe) -> bool:
+    def is_selected(stored: StoredKeyframe) -> bool:
         is_old = before_s is None or (stored.came_s is not None and stored.came_s < before_s)
         return is_old and (agents is None or names[stored.run_key] in agents)
 
@@ -97,15 +97,19 @@ def plan_forgetting(
         atlas.add_run(run.run_key, run.hello.name, run.credential)
         atlas.set_present(run.run_key, False)
     node_ids = atlas.restore(kept, restored_ranks(Config(), kept))
-    meant = [is_meant(stored) for stored in kept.keyframes]
-    removed = atlas.forget_keyframes([n for n, goes in zip(node_ids, meant, strict=True) if goes])
-    left = tuple(stored for stored, goes in zip(kept.keyframes, meant, strict=True) if not goes)
+    selection = [is_selected(stored) for stored in kept.keyframes]
+    removed = atlas.forget_keyframes(
+        [n for n, is_removed in zip(node_ids, selection, strict=True) if is_removed]
+    )
+    left = tuple(
+        stored for stored, is_removed in zip(kept.keyframes, selection, strict=True) if not is_removed
+    )
     with_keyframes = {stored.run_key for stored in left}
     is_named = [run.run_key for run in kept.runs if agents is None or run.hello.name in agents]
     empty = [RemoveRun(run) for run in is_named if run not in with_keyframes]
     poses = atlas.all_poses()
     return ForgettingPlan(
-        tuple(stored for stored, goes in zip(kept.keyframes, meant, strict=True) if goes),
+        tuple(stored for stored, is_removed in zip(kept.keyframes, selection, strict=True) if is_removed),
         left,
         len(atlas.graph.edges.loops),
         poses,

@@ -50,7 +50,7 @@ class KeyframeLookup:
         if entries := self._views.next_restored():
             yield from self.index(entries)
         is_aligned = yield from self._align_nearby(node_id)
-        seeks_maps = len(self._atlas.map_sizes()) > 1 and not self._queries.is_hurried
+        seeks_maps = len(self._atlas.map_sizes()) > 1 and not self._queries.has_backlog
         if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
             return  # the map is right here; the keyframe is described when nothing waits
         yield from self.describe(node_id)
@@ -83,7 +83,7 @@ class KeyframeLookup:
         if views.image(node_id) is None:
             return False
         for candidate in nearby_candidates(self._atlas.graph, node_id, views.with_image()):
-            if is_aligned and self._queries.is_hurried:
+            if is_aligned and self._queries.has_backlog:
                 break
             if not {node_id, candidate} <= views.by_node.keys():
                 continue  # removed meanwhile
@@ -106,15 +106,15 @@ class KeyframeLookup:
             return
         is_recheck = node_id % _RECHECK_INTERVAL == 0
         known = [candidate.id for candidate in found if candidate.id in views]
-        by_map, by_looks = choose_checks(
+        by_map, by_appearance = choose_checks(
             self._atlas.graph, node_id, known, self._views.with_image(), is_aligned, is_recheck
         )
-        if self._queries.is_hurried:
-            by_looks = larger_maps_first(self._atlas.graph, by_looks)
+        if self._queries.has_backlog:
+            by_appearance = larger_maps_first(self._atlas.graph, by_appearance)
         has_image = self._views.image(node_id) is not None
         yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
-        search = CandidateSearch([*by_map, *by_looks])
-        while (candidate := search.next_candidate(self._queries.is_hurried)) is not None:
+        search = CandidateSearch([*by_map, *by_appearance])
+        while (candidate := search.next_candidate(self._queries.has_backlog)) is not None:
             if not {node_id, candidate} <= views.keys():
                 continue  # removed meanwhile
             is_same_map = self._atlas.graph.is_same_map(node_id, candidate)

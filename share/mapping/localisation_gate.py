@@ -19,7 +19,7 @@ from share.types import F64
 
 PATIENCE = 20  # keyframes with loops after which agents enter another map however uncertain
 _WIDENS_AFTER = 4  # keyframes with loops; with n times as many, n times the sigma is enough
-AHEAD_M = 3.0  # what a wearer looks at
+AHEAD_M = 3.0  # what a wearer or robot looks at; a rotation moves it by this lever
 
 
 def sigma_ahead(cov: F64) -> float:

@@ -39,31 +39,31 @@ class MapGauge:
     """Remembers where each segment was shown."""
 
     def __init__(self) -> None:
-        self._shown: dict[int, tuple[int, F64]] = {}  # by segment: reference segment, T_map_odom as shown
+        self._published: dict[int, tuple[int, F64]] = {}  # by segment: reference segment, T_map_odom as shown
 
     def forget_all_but(self, segments: Collection[int]) -> None:
         """Forget all but these segments: the others have no keyframes."""
-        self._shown = {s: shown for s, shown in self._shown.items() if s in segments}
+        self._published = {s: published for s, published in self._published.items() if s in segments}
 
     def show(self, reference_segment: int, places: Mapping[int, SolvedPlace]) -> dict[int, F64]:
         """Return T_map_odom (4, 4) to show to each segment of a map, for places as solved."""
-        known = [s for s in places if self._shown.get(s, (None,))[0] == reference_segment]
-        T_shown_map = np.eye(4)
+        known = [s for s in places if self._published.get(s, (None,))[0] == reference_segment]
+        T_published_map = np.eye(4)
         if known:
-            T_shown_map = _gauge([places[s] for s in known], [self._shown[s][1] for s in known])
+            T_published_map = _gauge([places[s] for s in known], [self._published[s][1] for s in known])
         T_map_odom = np.array([place.T_map_odom for place in places.values()]).reshape(-1, 4, 4)
-        shown = dict(zip(places, se3.orthonormal(T_shown_map @ T_map_odom), strict=True))
-        self._shown |= {s: (reference_segment, T) for s, T in shown.items()}
-        return shown
+        published = dict(zip(places, se3.orthonormal(T_published_map @ T_map_odom), strict=True))
+        self._published |= {s: (reference_segment, T) for s, T in published.items()}
+        return published
 
 
-def _gauge(places: list[SolvedPlace], shown: list[F64]) -> F64:
-    """Return T_shown_map (4, 4) that moves these agents least from T_map_odom as shown before, as far as the
-    place of the surest is uncertain."""
+def _gauge(places: list[SolvedPlace], published: list[F64]) -> F64:
+    """Return T_published_map (4, 4) that moves these agents least from T_map_odom as published before, as far
+    as the place of the most certain one is uncertain."""
     solved_body = np.array([place.T_map_odom @ place.T_odom_body for place in places])
-    shown_body = np.array([T @ place.T_odom_body for T, place in zip(shown, places, strict=True)])
+    published_body = np.array([T @ place.T_odom_body for T, place in zip(published, places, strict=True)])
     weights = 1 / np.array([place.step_variance for place in places])
-    T = _least_motion(solved_body, shown_body, weights / weights.sum())
+    T = _least_motion(solved_body, published_body, weights / weights.sum())
     about = se3.from_rt(np.eye(3), solved_body[:, :3, 3].mean(axis=0))
     way = se3.log(se3.inverse(about) @ T @ about)
     length_m = float(np.linalg.norm(way[3:]) + AHEAD_M * np.linalg.norm(way[:3]))

@@ -15,11 +15,11 @@ import numpy as np
 from share.geometry import se3
 from share.mapping.loop_consistency import PLACE_M, PLACE_RAD
 from share.mapping.map_graph import MapGraph
-from share.mapping.missing_points import gone_regions
+from share.mapping.missing_points import vanished_regions
 from share.mapping.overlap_check import OTHER_DAY, SAME_DAY, OverlapCheck
 from share.mapping.recognition.verification import CameraView
 
-_GONE_CUSUM = 0.2  # CUSUM of the missing share of a keyframe above that of one day; beyond, it goes
+_OUTDATED_CUSUM = 0.2  # CUSUM of the missing share of a keyframe above that of one day; beyond, it goes
 _MIN_VIEWS = 2  # of today that miss something
 _MAX_COMPARED = 3  # keyframes of earlier sessions, with each of today
 
@@ -40,33 +40,33 @@ class MapRenewal:
     ) -> None:
         self._graph, self._camera_views, self._overlap_check = graph, camera_views, overlap_check
         self._losses: dict[int, _Loss] = {}
-        self._gone: dict[int, None] = {}
+        self._outdated: dict[int, None] = {}
 
     def review(self, node_id: int) -> None:
         """Compare a view of today with those of earlier sessions at its place, unless a merge of its segment
         is on probation."""
-        for earlier in self._earlier_at(node_id):
+        for earlier in self._earlier_keyframes_near(node_id):
             self._compare(node_id, earlier)
 
     def _compare(self, node_id: int, earlier: int) -> None:
         T_new_old = self._graph.relative_pose(node_id, earlier)
-        seen = gone_regions(self._camera_views[earlier], self._camera_views[node_id], T_new_old)
+        seen = vanished_regions(self._camera_views[earlier], self._camera_views[node_id], T_new_old)
         if not seen.is_informative or seen.found_share < OTHER_DAY.found:
             return  # too few of its points are found: darkness, blur
         loss = self._losses.setdefault(earlier, _Loss())
         excess = seen.missing_share - SAME_DAY.missing
         loss.missing, loss.view_count = max(0.0, loss.missing + excess), loss.view_count + (excess > 0)
-        if loss.missing > _GONE_CUSUM and loss.view_count >= _MIN_VIEWS:
-            self._gone[earlier] = None
+        if loss.missing > _OUTDATED_CUSUM and loss.view_count >= _MIN_VIEWS:
+            self._outdated[earlier] = None
 
-    def take_gone(self) -> list[int]:
+    def take_outdated(self) -> list[int]:
         """Return the keyframes to remove since the last call."""
-        gone, self._gone = list(self._gone), {}
-        for node_id in gone:
+        outdated, self._outdated = list(self._outdated), {}
+        for node_id in outdated:
             self._losses.pop(node_id, None)
-        return [node_id for node_id in gone if node_id in self._graph.poses]
+        return [node_id for node_id in outdated if node_id in self._graph.poses]
 
-    def _earlier_at(self, node_id: int) -> list[int]:
+    def _earlier_keyframes_near(self, node_id: int) -> list[int]:
         """Return the keyframes of earlier sessions that this one can stand for, the nearest."""
         graph, is_earlier = self._graph, self._overlap_check.is_earlier
         if is_earlier(node_id) or self._overlap_check.is_on_probation(graph.odometry.nodes[node_id].segment):

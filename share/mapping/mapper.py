@@ -35,13 +35,13 @@ class Mapper:
         """archive: images and views of the keyframes, where a map file keeps them."""
         self._config = config
         self._hellos: dict[str, Hello] = {}
-        self._views = KeyframeViews(archive)
-        self.atlas = Atlas(config.merge, self._views.by_node)
-        self._queries = QueryQueue(config.edge)
+        self.views = KeyframeViews(archive)
+        self.atlas = Atlas(config.merge, self.views.by_node)
+        self.queries = QueryQueue(config.edge)
         self._publisher = CorrectionPublisher()
         self._log = MapperLog()
         self._counters = self._log.counters
-        self._lookup = KeyframeLookup(config, self.atlas, self._views, self._queries, self._hellos, self._log)
+        self._lookup = KeyframeLookup(config, self.atlas, self.views, self.queries, self._hellos, self._log)
         self._lookup_job, self._solve_job = StepRunner(), StepRunner()
         self._empty_runs: list[KeyframeKey] = []
         self._retention = Retention(config.edge.keep_days)
@@ -69,7 +69,7 @@ class Mapper:
     def remove_run(self, agent: str) -> None:
         """Forget a run without keyframes that will not return."""
         self.atlas.remove_run(agent)
-        self._queries.remove_agent(agent)
+        self.queries.remove_agent(agent)
         self._publisher.remove_agent(agent)
         del self._hellos[agent]
         self._counters.remove_run(agent)
@@ -83,18 +83,18 @@ class Mapper:
         self._log.changes += [] if link is None else [link]
         hello = self._hellos[agent]
         node_id = self.atlas.add_keyframe(agent, keyframe, map_rank(self._config, hello))
-        self._views.add(node_id, self.atlas.key(node_id), keyframe, hello.rig)
+        self.views.add(node_id, self.atlas.key(node_id), keyframe, hello.rig)
         self._retention.add(node_id)
-        self._queries.add(agent, service_kind(self._config, hello), node_id, is_extra)
+        self.queries.add(agent, service_kind(self._config, hello), node_id, is_extra)
         events = []
         if keyframe.reference < 0 or (link is not None and link.reference < 0):
             T_map_odom, map_id = self.atlas.graph.place(node_id)
             events = [map_assignment(agent, map_id, T_map_odom, keyframe.id)]
         if redundant := self.atlas.culling.next_nodes(self._config.edge.max_keyframes):
             self.remove_keyframes(redundant)
-        if gone := self.atlas.renewal.take_gone():
-            self.remove_keyframes(gone)
-            events.append(MapEvent(agent, "map renewed", f"{len(gone)} keyframes show what is gone"))
+        if outdated := self.atlas.renewal.take_outdated():
+            self.remove_keyframes(outdated)
+            events.append(MapEvent(agent, "map renewed", f"{len(outdated)} keyframes show what is gone"))
         return events
 
     def remove_keyframes(self, node_ids: Sequence[int]) -> None:
@@ -116,7 +116,7 @@ class Mapper:
 
     def _finish_removal(self, removed: Sequence[RemovedKeyframe]) -> None:
         for keyframe in removed:
-            self._views.remove(keyframe.node_id)
+            self.views.remove(keyframe.node_id)
             self._retention.remove(keyframe.node_id)
         self._counters.removed_keyframes += len(removed)
         for agent in sorted({keyframe.key.agent for keyframe in removed}):
@@ -137,7 +137,7 @@ class Mapper:
             self.set_present(run.run_key, False)
         ranks = restored_ranks(self._config, kept)
         restored = list(zip(self.atlas.restore(kept, ranks), kept.keyframes, strict=True))
-        self._views.restore(
+        self.views.restore(
             [(n, one.keyframe_key, one.keyframe, self._hellos[one.run_key].rig) for n, one in restored]
         )
         for node_id, stored in restored:
@@ -159,17 +159,17 @@ class Mapper:
     def _next_job(self) -> Job | None:
         """Next keyframe to look up, or to describe for later queries."""
         while (node_id := self._next_query()) is not None:
-            if node_id in self._views.by_node:
+            if node_id in self.views.by_node:
                 return self._lookup.look_up(node_id)
-        if entries := self._views.next_restored():
+        if entries := self.views.next_restored():
             return self._lookup.index(entries)
-        node_id = self._views.next_undescribed()
+        node_id = self.views.next_undescribed()
         return None if node_id is None else self._lookup.describe(node_id)
 
     def _next_query(self) -> int | None:
-        node_id = self._queries.next_query()
+        node_id = self.queries.next_query()
         if node_id is None and len(self.atlas.map_sizes()) > 1:
-            node_id = self._queries.next_skipped()  # too late for an answer, but it may merge maps
+            node_id = self.queries.next_skipped()  # too late for an answer, but it may merge maps
         return node_id
 
     def next_solve(self) -> SolveStep | None:
@@ -190,7 +190,7 @@ class Mapper:
         except Exception as error:
             if isinstance(step, SolveStep):
                 return self.report_failure(step.kind, error, map_id=step.job.map_id)
-            agent = self.atlas.key(step.node_id).agent if step.node_id in self._views.by_node else None
+            agent = self.atlas.key(step.node_id).agent if step.node_id in self.views.by_node else None
             return self.report_failure(step.kind, error, agent)
 
     def report_failure(
@@ -242,13 +242,13 @@ class Mapper:
             "agents": {
                 agent: {
                     **own.report(),
-                    "queries_skipped": self._queries.skipped[agent],
+                    "queries_skipped": self.queries.skipped[agent],
                     "map_id": atlas.current_map_id(agent),
                     "consistency": asdict(atlas.quarantine.agreement.standing(agent)),
                 }
                 for agent, own in self._counters.runs.items()
             },
             "maps": atlas.map_sizes(),
-            "waiting": len(self._queries),
+            "waiting": len(self.queries),
             **self._counters.report(len(atlas.loop_acceptance.pending), len(atlas.graph.edges.loops)),
         }

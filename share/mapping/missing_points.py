@@ -76,7 +76,7 @@ def missing_points(query: CameraView, candidate: CameraView, T_c_q: F64) -> Miss
     )
 
 
-def gone_regions(old: CameraView, new: CameraView, T_new_old: F64) -> MissingRegions:
+def vanished_regions(old: CameraView, new: CameraView, T_new_old: F64) -> MissingRegions:
     """Count the points of an old view that a new one should show, and those that are gone from it."""
     T = se3.inverse(new.T_body_cam0) @ T_new_old @ old.T_body_cam0
     expected = _expected_points(T, old, new, _REGION_FOUND_PX)

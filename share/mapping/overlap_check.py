@@ -154,7 +154,7 @@ class OverlapCheck:
                 if comparison is None:
                     continue
                 probation.view_count += 1
-                if not _counts_already(probation, comparison, pose):
+                if not _repeats_counted_view(probation, comparison, pose):
                     probation.add(comparison)
                     probation.counted_at = pose
                 yield pair, probation
@@ -210,7 +210,7 @@ class OverlapCheck:
         return regions
 
 
-def _counts_already(probation: JoinProbation, comparison: Comparison, pose: F64) -> bool:
+def _repeats_counted_view(probation: JoinProbation, comparison: Comparison, pose: F64) -> bool:
     """Return whether a view shows what the last one showed: what has gone since another day is one thing,
     however many views miss it."""
     last = [] if probation.counted_at is None else [probation.counted_at]

@@ -12,27 +12,27 @@ from share.scheduling.qoe import QoeParameters
 from share.types import AgentKind
 from share.wire.messages import Hello
 
-HURRY_WAITING = 1  # with this many queued, a query verifies fewer candidates
-HURRY_CANDIDATES = 3  # at most these, and the first verified one ends the search
+MIN_BACKLOG = 1  # with this many queued, a query verifies fewer candidates
+MAX_BACKLOG_CANDIDATES = 3  # at most these, and the first verified one ends the search
 MAX_WAITING_EACH = 3  # queued queries of one agent
-ENOUGH_VERIFIED = 3  # verified candidates after which a search ends
+MAX_VERIFIED = 3  # verified candidates after which a search ends
 
 
 class CandidateSearch:
     """Candidates of one keyframe, best first.
 
-    The search ends after `ENOUGH_VERIFIED` verified candidates; while other queries wait after one, and after
-    at most `HURRY_CANDIDATES` tried ones.
+    The search ends after `MAX_VERIFIED` verified candidates; while other queries wait after one, and after
+    at most `MAX_BACKLOG_CANDIDATES` tried ones.
     """
 
     def __init__(self, candidates: Iterable[int]) -> None:
         self._remaining = deque(candidates)
         self._tried_count = self._verified_count = 0
 
-    def next_candidate(self, is_hurried: bool) -> int | None:
+    def next_candidate(self, has_backlog: bool) -> int | None:
         """Return the next candidate to verify; None when there are none left or the budget is spent."""
-        max_tried = HURRY_CANDIDATES if is_hurried else self._tried_count + 1
-        max_verified = 1 if is_hurried else ENOUGH_VERIFIED
+        max_tried = MAX_BACKLOG_CANDIDATES if has_backlog else self._tried_count + 1
+        max_verified = 1 if has_backlog else MAX_VERIFIED
         if not self._remaining or self._tried_count >= max_tried or self._verified_count >= max_verified:
             return None
         self._tried_count += 1
@@ -99,9 +99,9 @@ class QueryQueue:
         return sum(map(len, self._waiting.values()))
 
     @property
-    def is_hurried(self) -> bool:
+    def has_backlog(self) -> bool:
         """Return whether so many wait that the current search should end soon."""
-        return len(self) >= HURRY_WAITING
+        return len(self) >= MIN_BACKLOG
 
     def remove_agent(self, agent: str) -> None:
         for per_agent in (self.skipped, self._waiting, self._weights, self._last_turn):

@@ -32,7 +32,7 @@ _SECOND_WEIGHT = 1e-3  # of the second neighbour's distance, which decides betwe
 _MAX_SECOND = 10.0  # of that distance; further ones count as this
 
 
-def run_at_once(work: InSlices[T]) -> T:
+def run_without_pause(work: InSlices[T]) -> T:
     """Return the result of work in slices, without a pause."""
     while True:
         try:
@@ -92,7 +92,7 @@ class TwoNearest:
         rotations = poses[:, :3, :3].reshape(-1, 9) / (np.sqrt(2) * PLACE_RAD)
         self._points = np.concatenate([poses[:, :3, 3] / PLACE_M, rotations], axis=1)
         self._tree = KDTree(self._points, balanced_tree=False, compact_nodes=False)
-        self._is_left = np.ones(len(poses), bool)
+        self._is_kept = np.ones(len(poses), bool)
         self._max_distance = max_distance
         self.index = np.full((len(poses), 2), -1)
         self.distance = np.full((len(poses), 2), np.inf)
@@ -111,8 +111,8 @@ class TwoNearest:
 
     def remove(self, row: int) -> I64:
         """Remove a pose; return those of which it was a neighbour."""
-        self._is_left[row] = False
-        return np.flatnonzero((self.index == row).any(axis=1) & self._is_left)
+        self._is_kept[row] = False
+        return np.flatnonzero((self.index == row).any(axis=1) & self._is_kept)
 
     def _search_among(self, rows: I64, count: int) -> NDArray[np.bool_]:
         """Take the neighbours of `rows` (K,) from their `count` nearest in the tree; return where no other
@@ -123,7 +123,7 @@ class TwoNearest:
         is_found = found < len(self._points)
         found = np.where(is_found, found, 0)
         distance = _distance(self._points[rows, None], self._points[found])
-        distance[~is_found | ~self._is_left[found] | (found == rows[:, None])] = np.inf
+        distance[~is_found | ~self._is_kept[found] | (found == rows[:, None])] = np.inf
         two = np.argsort(distance, axis=1, kind="stable")[:, :2]
         self.index[rows, : two.shape[1]] = np.take_along_axis(found, two, axis=1)
         self.distance[rows, : two.shape[1]] = np.take_along_axis(distance, two, axis=1)

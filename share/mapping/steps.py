@@ -14,7 +14,7 @@ from share.mapping.recognition.keyframe_views import IndexEntry
 from share.mapping.recognition.patch_alignment import (
     ImageView,
     align_from_map,
-    align_unsure,
+    align_undetermined,
     align_verified,
 )
 from share.mapping.recognition.verification import (
@@ -87,7 +87,7 @@ class VerifyStep:
             return verified
         if isinstance(verified, Verification):
             return align_verified(verified, self.query_image, self.candidate_image)
-        aligned = align_unsure(verified, self.query_image, self.candidate_image)
+        aligned = align_undetermined(verified, self.query_image, self.candidate_image)
         if isinstance(aligned, Refusal):
             return verified
         turned = gravity_difference_deg(aligned.T_c_q, self.query_view, self.candidate_view)

@@ -56,7 +56,7 @@ def place_to_free(places: Sequence[tuple[str, float]], address: str, now_s: floa
     return oldest if is_unfair or now_s - places[oldest][1] >= SURE_S else None
 
 
-class Door:
+class PeerConnections:
     """The connections of one server."""
 
     def __init__(self, limits: PeerLimits) -> None:
@@ -106,22 +106,25 @@ class Door:
 
 
 class BoundedConnection(ServerConnection):  # type: ignore[misc]
-    """A connection through a door. Given as `create_connection=partial(BoundedConnection, door=door)`."""
+    """A connection counted by `PeerConnections`.
 
-    def __init__(self, *args: Any, door: Door, **options: Any) -> None:
+    Given as `create_connection=partial(BoundedConnection, connections=connections)`.
+    """
+
+    def __init__(self, *args: Any, connections: PeerConnections, **options: Any) -> None:
         super().__init__(*args, **options)
-        limits, self.address = door.limits, ""
-        self._door = door
+        limits, self.address = connections.limits, ""
+        self._peer_connections = connections
         self._frames = TokenBucket(limits.burst, limits.frames_per_s)
         self._bytes = TokenBucket(limits.burst_bytes, limits.bytes_per_s)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self.address = _holder_of(transport.get_extra_info("peername"))
-        self._door.arrive(self)
+        self._peer_connections.arrive(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._door.leave(self)
+        self._peer_connections.leave(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:

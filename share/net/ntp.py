@@ -10,8 +10,9 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
+from share.timing import SECOND_NS
+
 PACKET_BYTES = 48  # the header; extension fields and a MAC may follow
-SECOND_NS = 1_000_000_000
 KISS_STRATUM = 0  # of a refusal (kiss-o'-death)
 UNSYNCHRONISED_STRATUM = 16
 LEAP_UNKNOWN = 3  # leap indicator of an unsynchronised server

@@ -24,7 +24,7 @@ from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 from share.wire.messages import peer_id
 
 _BACKLOG_CHECK_MS = 20  # how often the data that wait are checked
-_FORGIVE_S = 10.0  # after so long a connection, an edge's flood is forgiven
+_FLOOD_TROUBLE_S = 10.0  # connected for so long, the link no longer reports an edge's flood as trouble
 _RECONNECT_S = 1.0  # after a failed handshake or connection; libzmq itself gives up after a ZMTP error
 _HANDSHAKE_EVENTS = (
     zmq.EVENT_CONNECTED
@@ -58,7 +58,7 @@ class ZmqAgentLink:
         self._guard = AgentConnectionGuard(BacklogLimits.for_frame_size(MAX_FRAME_BYTES))
         self._backoff = Backoff(time.monotonic_ns())
         self._reconnect_s: float | None = None  # monotonic time of the next attempt
-        self._forgive_s = 0.0  # monotonic time at which `_flood_trouble` ends
+        self._flood_trouble_until_s = 0.0  # monotonic time at which `_flood_trouble` ends
         self._has_connected = False  # since the last `poll_connected`
         self._open()
         try:
@@ -132,7 +132,9 @@ class ZmqAgentLink:
                 f"disconnected from the edge, which sends what no edge does ({excess}); this run goes on "
                 "without it and reconnects at growing intervals"
             )
-        elif self._flood_trouble and self._reconnect_s is None and now_ns * 1e-9 > self._forgive_s:
+        elif (
+            self._flood_trouble and self._reconnect_s is None and now_ns * 1e-9 > self._flood_trouble_until_s
+        ):
             self._flood_trouble = None
 
     def _keep_connected(self) -> None:
@@ -144,7 +146,7 @@ class ZmqAgentLink:
             elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._reconnect_s = self._trouble = None
                 self._has_connected = True
-                self._forgive_s = time.monotonic() + _FORGIVE_S
+                self._flood_trouble_until_s = time.monotonic() + _FLOOD_TROUBLE_S
             else:
                 self._reconnect_s = time.monotonic() + _RECONNECT_S
                 if event != zmq.EVENT_DISCONNECTED:

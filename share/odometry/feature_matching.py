@@ -70,10 +70,10 @@ def match_features(
     if frame.image1 is not None and rig.cam1 is not None and not start:
         images, cameras = (frame.image0, frame.image1), [rig.cam0, rig.cam1]
         indices = np.concatenate([indices, np.flatnonzero(is_stereo_due(appearance))])
-    in_cam1 = np.arange(len(indices)) >= cam0_count
+    is_in_cam1 = np.arange(len(indices)) >= cam0_count
     T = rig.T_cam1_cam0 if len(cameras) > 1 else None
     patch = predict_patches(
-        state, indices, appearance.ray_per_px[indices], appearance.slant[indices], T, in_cam1
+        state, indices, appearance.ray_per_px[indices], appearance.slant[indices], T, is_in_cam1
     )
     parts = [slice(0, cam0_count), slice(cam0_count, None)][: len(cameras)]
     expected = np.concatenate([c.distort(patch.uv[part]) for c, part in zip(cameras, parts, strict=True)])
@@ -93,33 +93,29 @@ def match_features(
         images, cam0_to_align, appearance.patch.kernels[indices[to_align]], px, warp[to_align]
     )
     accepted = _is_match(aligned, px, _MAX_REACH_PX)
-    predicted_px = patch.uv[to_align] + _solved(jacobian[to_align], aligned.px - px)
-    for camera, part in zip(cameras, (slice(0, cam0_to_align), slice(cam0_to_align, None)), strict=False):
-        if camera.is_fisheye:  # the Jacobian changes within a few px
-            predicted_px[part] = camera.normalise(
-                aligned.px[part].astype(np.float64), patch.uv[to_align[part]]
-            )
-        elif camera.distortion:
-            predicted_px[part] += _solved(
-                jacobian[to_align[part]], aligned.px[part] - camera.distort(predicted_px[part])
-            )
+    uv = patch.uv[to_align] + _solved(jacobian[to_align], aligned.px - px)
+    in_cam0, in_cam1 = slice(0, cam0_to_align), slice(cam0_to_align, None)
+    for camera, part in zip(cameras, (in_cam0, in_cam1), strict=False):
+        at = to_align[part]
+        uv[part] = _undistorted(camera, aligned.px[part], uv[part], patch.uv[at], jacobian[at])
         if camera.is_bounded:  # the aligned position may have no normalised coordinates
             accepted[part] &= camera.has_normalised(aligned.px[part].astype(np.float64))
-    _store(
-        out,
-        indices[to_align[:cam0_to_align]],
-        aligned,
-        predicted_px[:cam0_to_align],
-        accepted[:cam0_to_align],
-        slice(0, cam0_to_align),
-    )
+    _store(out, indices[to_align[in_cam0]], aligned, uv[in_cam0], accepted[in_cam0], in_cam0)
     if len(cameras) == 1:
         return out
-    number = indices[to_align[cam0_to_align:]]
-    cam1_accepted = np.flatnonzero(accepted[cam0_to_align:] & out.is_found[number])
-    return replace(
-        out, cam1=StereoMatches(number[cam1_accepted], predicted_px[cam0_to_align:][cam1_accepted])
-    )
+    number = indices[to_align[in_cam1]]
+    cam1_accepted = np.flatnonzero(accepted[in_cam1] & out.is_found[number])
+    return replace(out, cam1=StereoMatches(number[cam1_accepted], uv[in_cam1][cam1_accepted]))
+
+
+def _undistorted(camera: Camera, px: F32, uv: F64, predicted_uv: F64, jacobian: F64) -> F64:
+    """Return the normalised positions (N, 2) of aligned ones, px. uv: to first order, from `predicted_uv`;
+    jacobian: d px / d uv there."""
+    if camera.is_fisheye:  # the Jacobian changes within a few px
+        return camera.normalise(px.astype(np.float64), predicted_uv)
+    if camera.distortion:
+        return np.asarray(uv + _solved(jacobian, px - camera.distort(uv)))
+    return uv
 
 
 def match_by_flow(

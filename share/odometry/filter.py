@@ -143,22 +143,27 @@ def innovation_covariance(
     S.reshape(M, 2, 2 * M)[:] += H_rho[:, :, None] * HP.T.take(feature_columns, axis=0)[:, None, :]
     for columns, part in groups:
         S[part] += H_anchor[part] @ HP[:, columns].T
-    S.reshape(-1)[:: 2 * M + 1] += np.repeat(
-        rows.sigma**2 + CORRELATION_INFLATION * rows.correlated_sigma**2, 2
-    ).astype(dtype)
-    first, second = _stereo_pairs(rows.feature)
-    for axis in (0, 1):
-        entries = 2 * first + axis, 2 * second + axis
-        S[entries] += (
-            CORRELATION_INFLATION * rows.correlated_sigma[first] * rows.correlated_sigma[second]
-        ).astype(dtype)
-        S[entries[::-1]] = S[entries]
+    _add_measurement_noise(S, rows)
     if common_cov is not None:
         B = H_anchor @ se3.adjoint(state.T).astype(dtype)
         S += B @ common_cov.astype(dtype) @ B.T
     poses = HP[:, KEYFRAMES_START : state.features_start].reshape(2 * M, -1, 6)
     poses += HP[:, None, POSE]
     return HP, S
+
+
+def _add_measurement_noise(S: FloatArray, rows: FeatureMeasurements) -> None:
+    """Add R to S (2 M, 2 M): independent noise, and the part that both cameras' measurements of a feature
+    share."""
+    S.reshape(-1)[:: len(S) + 1] += np.repeat(
+        rows.sigma**2 + CORRELATION_INFLATION * rows.correlated_sigma**2, 2
+    ).astype(S.dtype)
+    first, second = _stereo_pairs(rows.feature)
+    shared = CORRELATION_INFLATION * rows.correlated_sigma[first] * rows.correlated_sigma[second]
+    for axis in (0, 1):
+        entries = 2 * first + axis, 2 * second + axis
+        S[entries] += shared.astype(S.dtype)
+        S[entries[::-1]] = S[entries]
 
 
 def needs_double_precision(state: FilterState) -> bool:

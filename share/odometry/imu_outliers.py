@@ -147,35 +147,12 @@ class ImuOutlierDetector:
             return None
         while self._rejected and stamps_ns[0] - self._rejected[0].stamp_ns >= _HISTORY_NS:
             self._rejected.popleft()
-        if self._run_start_ns is None and self._newest is not None:
-            steps = np.empty_like(values)
-            np.subtract(values[1:], values[:-1], out=steps[1:])
-            steps[0] = values[0] - self._accepted_value
-            np.abs(steps, out=steps)
-            suspect = (steps > _SUSPECT_MARGIN).any()
-            if not suspect or (steps <= _STEP_MARGIN).all():  # the common case
-                if suspect:
-                    self._flag_suspects(stamps_ns, steps)
-                self._recent_steps = np.concatenate([self._recent_steps, steps])[-_RECENT_STEPS:]
-                if len(stamps_ns) > 1:
-                    self._note_newest(int(stamps_ns[-2]), values[-2])
-                self._note_newest(int(stamps_ns[-1]), values[-1])
-                self._accepted_ns, self._accepted_value = int(stamps_ns[-1]), values[-1]
-                if self._restart_window is not None:
-                    self._extend_restart(
-                        self._restart_window, stamps_ns, values, np.ones(len(values), np.bool_)
-                    )
-                return None
+        if self._accept_all(stamps_ns, values):
+            return None
         accepted, k = np.ones(len(values), np.bool_), 0
         while k < len(values):
             stamp_ns = int(stamps_ns[k])
-            if self._newest is None:
-                self._restart_window = _RestartWindow(None)
-            elif stamp_ns - self._newest[0] > _MAX_GAP_NS:
-                is_gap = 0 < self._step_ns <= _MAX_GAP_NS  # else samples are always this far apart
-                self._restart_window = _RestartWindow(
-                    (self._accepted_ns, self._accepted_value) if is_gap else None
-                )
+            self._restart_after_gap(stamp_ns)
             if self._restart_window is None:
                 accepted[k] = self._check_sample(stamp_ns, self._newest, values[k])
                 k += 1
@@ -184,6 +161,37 @@ class ImuOutlierDetector:
                 accepted[k:end] = self._check_restart(self._restart_window, stamps_ns[k:end], values[k:end])
                 k = end
         return None if accepted.all() else accepted
+
+    def _accept_all(self, stamps_ns: I64, values: F64) -> bool:
+        """Accept the samples if no step is too large, which is the common case. Return whether they are."""
+        if self._run_start_ns is not None or self._newest is None:
+            return False
+        steps = np.empty_like(values)
+        np.subtract(values[1:], values[:-1], out=steps[1:])
+        steps[0] = values[0] - self._accepted_value
+        np.abs(steps, out=steps)
+        suspect = (steps > _SUSPECT_MARGIN).any()
+        if suspect and not (steps <= _STEP_MARGIN).all():
+            return False
+        if suspect:
+            self._flag_suspects(stamps_ns, steps)
+        self._recent_steps = np.concatenate([self._recent_steps, steps])[-_RECENT_STEPS:]
+        if len(stamps_ns) > 1:
+            self._note_newest(int(stamps_ns[-2]), values[-2])
+        self._note_newest(int(stamps_ns[-1]), values[-1])
+        self._accepted_ns, self._accepted_value = int(stamps_ns[-1]), values[-1]
+        if self._restart_window is not None:
+            self._extend_restart(self._restart_window, stamps_ns, values, np.ones(len(values), np.bool_))
+        return True
+
+    def _restart_after_gap(self, stamp_ns: int) -> None:
+        """Begin a restart at the first sample, and at one after a gap."""
+        if self._newest is None:
+            self._restart_window = _RestartWindow(None)
+        elif stamp_ns - self._newest[0] > _MAX_GAP_NS:
+            is_gap = 0 < self._step_ns <= _MAX_GAP_NS  # else samples are always this far apart
+            before = (self._accepted_ns, self._accepted_value) if is_gap else None
+            self._restart_window = _RestartWindow(before)
 
     def inflation(self, from_ns: int, to_ns: int) -> ImuInflation | None:
         """Return the inflation for rejected or suspect samples in [from_ns, to_ns); None without any."""

@@ -203,7 +203,7 @@ class InertialTracker:
             move(state, T_odom_cam @ se3.inverse(self._rig.T_body_cam0))
         landmarks = LandmarkMap(state, self._rig, self._config)
         self._imu.restart(state)
-        self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
+        self._keyframes.add_and_finish(frame, landmarks, self._imu.rate)
         if len(state.feature_ids) < WEAK:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
         self._adopt_state(landmarks, new_segment=T_odom_cam is None)
@@ -312,7 +312,7 @@ class InertialTracker:
         """Return whether a single camera's window gives the scale, and the state has converged. is_keyframe:
         the frame becomes a keyframe of it."""
         if is_keyframe:
-            self._keyframes.add_at_once(frame, landmarks, self._imu.rate)
+            self._keyframes.add_and_finish(frame, landmarks, self._imu.rate)
         window, s = self._mono_window, landmarks.state
         if window is None or not (is_keyframe or window.wants_frame(s.stamp_ns)):
             return False

@@ -16,7 +16,7 @@ from share.geometry.camera import Rig, rays
 from share.odometry.feature_matching import anchors_in_camera
 from share.odometry.state import FilterState
 from share.types import F32, F64, U8, Frame
-from share.vision.depth import disparity_per_rho, from_depth_camera, from_stereo, search_depth
+from share.vision.depth import MIN_RHO, disparity_per_rho, from_depth_camera, from_stereo, search_depth
 from share.vision.orb import measures_depth
 
 MEAN_RHO = 0.4  # 1/m, where nothing is known
@@ -24,7 +24,6 @@ ROOM_LOG_SIGMA = 0.8  # sigma of the logarithm of a room's inverse depth
 FEATURE_SPREAD = 0.5  # sigma of a feature's inverse depth, relative to the room's
 _MIN_NEIGHBOURS = 8  # features in the state; with fewer the prior is that of an unknown room
 _NEIGHBOUR_PX = 30.0  # features nearer than this weigh about the same
-_MIN_RHO = 0.03  # 1/m
 _STEREO_PX = 0.25  # noise of a disparity
 _DEPTH_SIGMA_PX, _DEPTH_BASELINE_M = 0.3, 0.05  # px, m: of the stereo pair inside a depth camera
 _MAX_DISPARITY_ERROR_PX = 2.0  # between the epipolar search and its refinement
@@ -97,7 +96,7 @@ def prior_from_neighbours(state: FilterState, px: F32, known_px: F32) -> DepthPr
     weight /= weight.sum(axis=1, keepdims=True)
     rho = weight @ known_rho
     return DepthPrior(
-        rho, FEATURE_SPREAD * rho, weight * (known_rho / np.maximum(state.rho, _MIN_RHO)), np.zeros(N)
+        rho, FEATURE_SPREAD * rho, weight * (known_rho / np.maximum(state.rho, MIN_RHO)), np.zeros(N)
     )
 
 
@@ -106,5 +105,5 @@ def current_rho(state: FilterState) -> F64:
     least 0.03."""
     T = anchors_in_camera(state)
     z = (T[:, 2, :3] * rays(state.ray)).sum(axis=1) + state.rho * T[:, 2, 3]
-    out: F64 = np.maximum(state.rho, _MIN_RHO) / np.maximum(z, 0.1)
-    return np.maximum(out, _MIN_RHO)
+    out: F64 = np.maximum(state.rho, MIN_RHO) / np.maximum(z, 0.1)
+    return np.maximum(out, MIN_RHO)

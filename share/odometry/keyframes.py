@@ -155,7 +155,7 @@ class KeyframeScheduler:
             stamp_ns, T_odom_body, inlier_count
         )
 
-    def add_at_once(self, frame: Frame, landmarks: LandmarkMap, rate: F64) -> None:
+    def add_and_finish(self, frame: Frame, landmarks: LandmarkMap, rate: F64) -> None:
         """Make the frame just tracked a keyframe and do all its work at once; for the time before the
         first pose. rate (3,): rad/s."""
         self.add(frame, landmarks, rate, urgent=True)

@@ -19,6 +19,7 @@ from share.odometry.state import GYRO_BIAS, FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import field_mask
+from share.vision.depth import MIN_RHO
 from share.vision.keyframe_images import Surfaces
 from share.vision.orb import measures_depth
 
@@ -35,7 +36,7 @@ _UNKNOWN_BIAS_SIGMA = 2e-3  # rad/s, of the gyroscope; with more, rotation may p
 _NEAR_RATIO = 2.0  # of a near feature's inverse depth to the median
 _MAX_NEAR_SHARE = 0.25  # of the features; more than these are a part of the room
 _SLANT_PERIOD = 4  # frames between updates of a feature's slant
-_MIN_RHO, _MIN_DEPTH_M = 0.03, 0.2  # 1/m; m
+_MIN_DEPTH_M = 0.2
 _UNKNOWN_RHO_SIGMA = 0.05  # 1/m; half a pixel a frame at walking speed
 _KNOWN_DEPTH_RATIO = 0.1  # relative sigma of a known inverse depth
 _MIN_PLANE_OFFSET = 0.05  # share of the distance to a surface's plane that is left: nearer is seen edge on
@@ -142,7 +143,7 @@ class LandmarkMap:
         """Return the depths (N,) m of the features in cam0."""
         s = self.state
         T = feature_matching.anchors_in_camera(s)
-        z = (T[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _MIN_RHO) + T[:, 2, 3]
+        z = (T[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, MIN_RHO) + T[:, 2, 3]
         out: F64 = np.maximum(z, _MIN_DEPTH_M)
         return out
 
@@ -354,4 +355,4 @@ def _near_few(rho: F64) -> NDArray[np.bool_]:
     They say the most about translation: one who stands before the camera and sways outweighs a room.
     """
     near: NDArray[np.bool_] = rho > _NEAR_RATIO * np.median(rho)
-    return near & (near.mean() < _MAX_NEAR_SHARE)
+    return near & np.bool_(near.mean() < _MAX_NEAR_SHARE)

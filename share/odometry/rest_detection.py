@@ -28,7 +28,7 @@ _PRIOR = 1e-9  # keeps the fit solvable where all features are at infinity
 _MAX_DARK_M_S, _MAX_DARK_SIGMA_M_S = 0.04, 0.03  # velocity and its sigma where they say nothing
 
 
-class _View(NamedTuple):
+class _StaticFeatures(NamedTuple):
     """Static features in an image: ids (N,), normalised positions uv (N, 2). R_odom_cam (3, 3)."""
 
     stamp_ns: int
@@ -41,13 +41,13 @@ class RestDetector:
     """Keeps the views of the last moment."""
 
     def __init__(self) -> None:
-        self._views: deque[_View] = deque()
+        self._views: deque[_StaticFeatures] = deque()
 
     def is_at_rest(self, s: FilterState, uv: F64, is_static: NDArray[np.bool_], imu_is_still: bool) -> bool:
         """Return whether the body was at rest until the state's time. uv (N, 2), is_static (N,): normalised
         positions of the state's features in the image of that time. Call it for every frame."""
         R_odom_cam = s.T[:3, :3] @ s.T_body_cam[:3, :3]
-        view = _View(s.stamp_ns, s.feature_ids[is_static], uv[is_static], R_odom_cam)
+        view = _StaticFeatures(s.stamp_ns, s.feature_ids[is_static], uv[is_static], R_odom_cam)
         while len(self._views) > 1 and view.stamp_ns - self._views[1].stamp_ns >= _MIN_AGE_NS:
             self._views.popleft()  # the first is the newest that is old enough
         self._views.append(view)
@@ -58,7 +58,7 @@ class RestDetector:
         return _image_speed(self._views[0], view, current_rho(s)[is_static]) < _MAX_SPEED_M_S
 
 
-def _image_speed(earlier: _View, view: _View, rho: F64) -> float:
+def _image_speed(earlier: _StaticFeatures, view: _StaticFeatures, rho: F64) -> float:
     """Return the camera's mean speed, m/s, between an earlier view and this one, with inverse depths rho (N,)
     in this one; inf where the earlier is too near, or shows too few of the same features.
 

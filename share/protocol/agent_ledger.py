@@ -40,9 +40,10 @@ class KeyframeLedger:
 
     Only the first `window` pending ones are in flight. One is sent again once the edge has answered something
     that was sent after it: a link keeps the order, so until then it is on its way, and to send it twice would
-    fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896). A full ledger drops the oldest acknowledged one
-    (policy drop_oldest_acknowledged); without one, the oldest pending one (drop_oldest), and rebases the next
-    keyframe onto the dropped one's reference. `counts` has both, by name.
+    fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896).
+
+    A full ledger drops the oldest acknowledged one (policy drop_oldest_acknowledged); without one, the oldest
+    pending one (drop_oldest), and rebases the next keyframe onto the dropped one's reference. `counts` has both, by name.
     """
 
     def __init__(self, capacity: int, window: int) -> None:
@@ -154,10 +155,10 @@ class KeyframeLedger:
         self._buffered_at_edge = frozenset(ack.buffered)
         if max_buffered in self._pending:  # it was in flight when this session began
             self._max_sent_id = max(self._max_sent_id, max_buffered)
-        self._hasten_overtaken()
+        self._bring_resends_forward()
         return True
 
-    def _hasten_overtaken(self) -> None:
+    def _bring_resends_forward(self) -> None:
         """Make each gap due soon: a keyframe that has not arrived though a later one, sent after it, has.
 
         Once for each time that it is sent: an acknowledgement that is repeated says nothing new."""
@@ -280,7 +281,7 @@ class KeyframeChain:
             ):  # more accurate than the candidates' chain
                 T_ref_body = orthonormal(earlier.T_earlier_body[-1].astype(np.float64))
                 cov = earlier.cov[-1].astype(np.float64)
-            earlier = spread_earlier(earlier, self.next_id)
+            earlier = select_earlier(earlier, self.next_id)
         keyframe = Keyframe(
             id=self.next_id,
             reference=self.next_id - 1 if self._has_reference else -1,
@@ -320,7 +321,7 @@ class KeyframeChain:
 _EARLIER_STEPS = 3, 7, 13  # keyframes back, to which a keyframe's pose is sent beside that to its reference
 
 
-def spread_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
+def select_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
     """Return the poses relative to the keyframes nearest to `_EARLIER_STEPS` before this one.
 
     A chain of steps between neighbours loses what the tracker knows of longer ones: its window."""

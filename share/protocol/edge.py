@@ -17,11 +17,15 @@ from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import SaveKeyframe, SaveObject, SavePoses, SaveRun
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
-from share.protocol.edge_membership import RoomMembership
+from share.protocol.admission import RunRegistry
+from share.protocol.edge_membership import RoomMembership, RunTrackers
+from share.protocol.edge_records import EdgeOutput
 from share.protocol.keyframe_intake import KeyframeQuota, OdometryBase, sanitise
 from share.protocol.peer import Peer, RestoredRun, fault_warnings
+from share.protocol.room_desk import RoomDesk
 from share.protocol.versions import refusal_of_version
 from share.scheduling.policies import AgentReport
+from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import Throttle
 from share.types import Keyframe
 from share.wire import messages as wire
@@ -32,12 +36,12 @@ _NO_SESSION = 0  # in a pong to a client that the edge has forgotten: it says he
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 
-class Edge(RoomMembership):
+class Edge:
     """Serves all agents of one room.
 
     session: names this start of the edge, so that agents notice a restart. has_store: acknowledge a keyframe
     only after `ChangesSaved`. restored: runs of earlier sessions; objects: of the room. began_ns: origin of
-    the times in records (default: the first event).
+    the times in records (default: the first event). trackers: those that the edge runs for its agents.
     """
 
     def __init__(
@@ -48,9 +52,18 @@ class Edge(RoomMembership):
         restored: Sequence[RestoredRun] = (),
         began_ns: int | None = None,
         objects: Sequence[SaveObject] = (),
+        trackers: RunTrackers | None = None,
     ) -> None:
-        super().__init__(config, session, has_store, restored, began_ns, objects)
+        self._config, self._session, self._registry = config, session, RunRegistry()
+        for run in restored:
+            self._registry.restore(run)
         self.latest_poses = self._registry.latest_poses
+        self._out = EdgeOutput(self._registry, has_store, began_ns)
+        self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
+        self.room = RoomDesk(self._out, self._registry, session, config.edge.silent_s, objects)
+        self.room.restore(run.last_finding for run in restored if run.last_finding is not None)
+        parts = self._registry, self._out, self._rate_scheduler, trackers or RunTrackers(), self.room
+        self._membership = RoomMembership(config, session, *parts)
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._version_throttle, self._internal_errors = Throttle(_VERSION_REFUSAL_HZ, 1.0), 0
 
@@ -61,7 +74,7 @@ class Edge(RoomMembership):
         self._out.begin(now_ns)
         try:
             # first: after a hello, the keyframes of a forgotten run would count as known
-            self._forget_empty_runs()
+            self._membership.forget_empty_runs()
             self._dispatch(event)
         except Exception as error:
             self._on_internal_error(event, error)
@@ -83,7 +96,7 @@ class Edge(RoomMembership):
                 self._acknowledge(*self._out.durability.mark_saved(event.ticket))
                 self.room.mark_saved(event.ticket)
             case ed.EdgeTick():
-                self._check_silence()
+                self._membership.check_silence()
                 self.room.tick()
 
     def _on_internal_error(self, event: ed.EdgeEvent, error: Exception) -> None:
@@ -106,18 +119,20 @@ class Edge(RoomMembership):
             self._on_other_version(event.peer_id, error)
             return
         except WireError as error:
-            self._count_bad_message(client or peer, str(error))
+            self._out.count_bad_message(client or peer, str(error))
             return
-        if peer is not None and not self._may_send(event, peer, message):
+        if peer is not None and not self._membership.may_send(event, peer, message):
             return
         if client is not None and not self.room.may_send(event, client):
-            self._count_bad_message(None, f"a key that is not authorized for '{client.name}' used its run")
+            self._out.count_bad_message(
+                None, f"a key that is not authorized for '{client.name}' used its run"
+            )
             return
         match message:
             case ClientHello():
                 self.room.on_hello(event, message)
             case wire.Hello() if client is None:
-                self._on_hello(event, message)
+                self._membership.on_hello(event, message)
             case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 times = message.sent_ns, self._out.now_ns, self._out.now_ns
                 session = _NO_SESSION if self.room.clients.was_removed(event.peer_id) else self._session
@@ -126,7 +141,7 @@ class Edge(RoomMembership):
                 self.room.on_message(event, client, message)
             case wire.Bye() if peer:
                 peer.status.leave()
-                self._mark_gone(peer, "left", "sent bye")
+                self._membership.mark_gone(peer, "left", "sent bye")
             case _ if peer:
                 self._on_agent_message(peer, message)
             case _:
@@ -153,16 +168,17 @@ class Edge(RoomMembership):
         arrived = peer.counts["keyframes"], peer.counts["poses"]
         service = peer.computation.held_ms, self._registry.shares_map(peer)
         report = AgentReport(peer.hello.kind, evaluation, self._out.now_ns, *arrived, *service)
-        t_s = self._out.elapsed_s
-        self._send_grant(peer, self._rate_scheduler.evaluate(peer.name, report, peer.computation.ms, t_s))
-        if (news := self._rate_scheduler.capacity_news(self._out.now_ns)) is not None:
-            self._out.record("room full", None, news)
+        computation_ms, t_s = peer.computation.ms, self._out.elapsed_s
+        grant = self._rate_scheduler.evaluate(peer.name, report, computation_ms, t_s)
+        self._membership.send_grant(peer, grant)
+        if (change := self._rate_scheduler.capacity_change(self._out.now_ns)) is not None:
+            self._out.record("room full", None, change)
 
     def _on_other_version(self, peer_id: bytes, error: VersionError) -> None:
         self._registry.unjoined.counts["other_version"] += 1
         reason = refusal_of_version(error)
         if reason is not None and self._version_throttle.admit(peer_id, self._out.now_ns) is not None:
-            self._refuse(peer_id, reason, error.version)
+            self._membership.refuse(peer_id, reason, error.version)
 
     # ------------------------------------------------------------------ keyframes and the map
 
@@ -188,14 +204,14 @@ class Edge(RoomMembership):
         try:
             return peer.reorder_buffer.push(keyframe)
         except ValueError as error:
-            self._count_bad_message(peer, str(error))
+            self._out.count_bad_message(peer, str(error))
             return []
 
     def _apply(self, peer: Peer, keyframe: Keyframe) -> None:
         try:
             keyframe, problem = sanitise(keyframe, peer.odometry_base, peer.hello.rig.cam0)
         except ValueError as error:
-            self._count_bad_message(peer, str(error))
+            self._out.count_bad_message(peer, str(error))
             return
         if problem:
             self._suspect(peer, problem)
@@ -232,7 +248,7 @@ class Edge(RoomMembership):
         else:
             peer.last_finding = finding
             if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
-                self._send_correction(peer, finding)
+                self._out.send_correction(peer, finding)
 
     # ------------------------------------------------------------------ reports
 

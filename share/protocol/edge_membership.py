@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import ClassVar
 
 from share.config import Config
 from share.event_kinds import EventKind
-from share.mapping.corrections import MapEvent
-from share.mapping.map_changes import RemoveRun, SaveCredential, SaveObject
+from share.geometry.camera import Rig
+from share.mapping.map_changes import RemoveRun, SaveCredential
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
 from share.protocol.edge_records import EdgeOutput
-from share.protocol.peer import Peer, RestoredRun
-from share.protocol.room_clients import Client
+from share.protocol.peer import Peer
 from share.protocol.room_desk import RoomDesk
 from share.scheduling.rate_scheduler import RateScheduler
 from share.scheduling.room_budget import RateGrant
@@ -23,49 +20,75 @@ from share.wire import messages as wire
 from share.wire.codec import WIRE_VERSION
 
 
-class RoomMembership:
-    """The runs of a room and their presence. Effects go to `_out`."""
+class RunTrackers:
+    """Trackers that the edge runs for the room's runs. Here none: agents track themselves. Another kind is
+    `remote_tracking.RemoteTrackers`."""
 
-    tracks_agents: ClassVar[bool] = False  # True where agents stream frames: `remote_tracking`
+    tracks_agents = False
+
+    def objection(self, key: str | None, rig: Rig) -> str | None:
+        """Return why no tracker can start for a run (key None: a new run); None if one can."""
+        return None
+
+    def add(self, key: str, rig: Rig) -> None:
+        """Add a run that has joined."""
+
+    def remove(self, key: str) -> None:
+        """Remove a run that is forgotten."""
+
+    def start(self, key: str) -> Sequence[ed.TrackerEffect]:
+        """Start the run's tracker, unless it is running."""
+        return ()
+
+    def stop(self, key: str) -> Sequence[ed.TrackerEffect]:
+        """Stop the run's tracker, if it is running."""
+        return ()
+
+    def is_ready(self, key: str) -> bool:
+        """Return whether the run may be welcomed."""
+        return True
+
+
+class RoomMembership:
+    """The runs of a room and their presence. Effects go to `out`."""
 
     def __init__(
         self,
         config: Config,
         session: int,
-        has_store: bool,
-        restored: Sequence[RestoredRun],
-        began_ns: int | None,
-        objects: Sequence[SaveObject],
+        registry: RunRegistry,
+        out: EdgeOutput,
+        rate_scheduler: RateScheduler,
+        trackers: RunTrackers,
+        room: RoomDesk,
     ) -> None:
-        """See `share.protocol.edge.Edge`."""
-        self._config, self._session, self._registry = config, session, RunRegistry()
-        self._out = EdgeOutput(self._registry, has_store, began_ns)
-        self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
-        self._admission = Admission(config.edge, self.tracks_agents, self._rate_scheduler.objection)
-        self.room = RoomDesk(self._out, self._registry, session, config.edge.silent_s, objects)
-        for run in restored:
-            self._registry.restore(run)
-        self.room.restore(run.last_finding for run in restored if run.last_finding is not None)
+        self._session, self._registry, self._out = session, registry, out
+        self._silent_s = config.edge.silent_s
+        self._rate_scheduler, self._trackers, self._room = rate_scheduler, trackers, room
+        self._admission = Admission(config.edge, trackers.tracks_agents, rate_scheduler.objection)
 
-    def _on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> None:
+    def on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> None:
         """Welcome a new or known run, or refuse it. No answer while the name's present run may be dead: the
         agent repeats its hello."""
         if (reason := self._objection(event, hello)) is not None:
             if not self._admission.is_name_stale(hello.name, self._registry, self._out.now_ns):
-                self._refuse(event.peer_id, reason)
+                self.refuse(event.peer_id, reason)
             return
-        self._welcome(self._registry.get(event.peer_id) or self._join(event, hello))
+        self.welcome(self._registry.get(event.peer_id) or self._join(event, hello))
 
     def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        return self._admission.objection(event, hello, self._registry, self._out.now_ns)
+        if (reason := self._admission.objection(event, hello, self._registry, self._out.now_ns)) is not None:
+            return reason
+        existing = self._registry.get(event.peer_id)
+        return self._trackers.objection(None if existing is None else existing.key, hello.rig)
 
     def _make_room(self, peer: Peer) -> None:
         """Remove the robots that are displaced by a run that has joined."""
         displaced = self._rate_scheduler.displaced(peer.name, peer.hello.kind, self._out.now_ns)
         for other in self._registry.present() if displaced else ():
             if other.name in displaced:
-                self._refuse(other.id, f"no air left beside headsets: '{peer.name}' has joined")
-                self._mark_gone(other, "left", f"made room for '{peer.name}'")
+                self.refuse(other.id, f"no air left beside headsets: '{peer.name}' has joined")
+                self.mark_gone(other, "left", f"made room for '{peer.name}'")
 
     def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
         """Return the new run of an admitted hello."""
@@ -80,30 +103,35 @@ class RoomMembership:
         self._rate_scheduler.begin_run(peer.name)
         self._out.record("agent joined", peer, f"{hello.kind} '{hello.name}'")
         self._make_room(peer)
+        self._trackers.add(peer.key, hello.rig)
         return peer
 
-    def _refuse(self, peer_id: bytes, reason: str, version: int = WIRE_VERSION) -> None:
+    def refuse(self, peer_id: bytes, reason: str, version: int = WIRE_VERSION) -> None:
         self._out.send(peer_id, wire.Refused(reason), version)
         self._registry.sender(peer_id).refusals.add(reason, self._out.now_ns)
         self._out.record("refused", None, reason)
 
-    def _welcome(self, peer: Peer) -> None:
-        """Send a welcome, and the last correction again: a hello means that the agent may have missed it."""
+    def welcome(self, peer: Peer) -> None:
+        """Send a welcome, and the last correction again: a hello means that the agent may have missed it.
+        Where the edge tracks it, only once its tracker is ready."""
+        self._out.add(*self._trackers.start(peer.key))
+        if not self._trackers.is_ready(peer.key):
+            return
         peer.is_welcomed, hold_ms = True, self._rate_scheduler.hold_ms(peer.name, self._out.now_ns)
         self._out.send(peer.id, wire.Welcome(self._session, peer.durable_below, hold_ms))
         peer.grant = None
         first = self._rate_scheduler.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
-        self._send_grant(peer, first)
+        self.send_grant(peer, first)
         if peer.last_finding is not None:
-            self._send_correction(peer, peer.last_finding, is_repeat=True)
+            self._out.send_correction(peer, peer.last_finding, is_repeat=True)
 
-    def _comes_back(self, peer: Peer, message: wire.Message) -> bool:
+    def _try_readmit(self, peer: Peer, message: wire.Message) -> bool:
         """Return whether a run that left is present again by this message."""
         if isinstance(message, wire.Bye):  # repeated or late
             return False
         if (reason := self._capacity_objection(peer)) is not None:
             if isinstance(message, wire.Hello | wire.Ping):  # keyframes are not answered one by one
-                self._refuse(peer.id, reason)
+                self.refuse(peer.id, reason)
             else:
                 peer.refusals.add(reason, self._out.now_ns)
             return False
@@ -112,7 +140,8 @@ class RoomMembership:
 
     def _capacity_objection(self, peer: Peer) -> str | None:
         """Return why a run that left may not come back; None if it may."""
-        return self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
+        reason = self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
+        return reason or self._trackers.objection(peer.key, peer.hello.rig)
 
     def _readmit(self, peer: Peer) -> None:
         self._supersede(peer.name)
@@ -120,26 +149,27 @@ class RoomMembership:
         self._out.add(ed.SetPresence(peer.key, True))
         self._out.record("reconnected", peer, "sends again")
         self._make_room(peer)
+        self._out.add(*self._trackers.start(peer.key))
 
     def _supersede(self, name: str) -> None:
         """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""
         for other in self._registry.present():
             if other.name == name:
-                self._mark_gone(other, "silent", "replaced by a newer run of the same name")
+                self.mark_gone(other, "silent", "replaced by a newer run of the same name")
 
-    def _check_silence(self) -> None:
-        limit_s = self._config.edge.silent_s
+    def check_silence(self) -> None:
         for peer in self._registry.present():
-            if self._out.now_ns - peer.last_received_ns > seconds_to_ns(limit_s):
-                self._mark_gone(peer, "silent", f"no message for {limit_s:g} s")
+            if self._out.now_ns - peer.last_received_ns > seconds_to_ns(self._silent_s):
+                self.mark_gone(peer, "silent", f"no message for {self._silent_s:g} s")
 
-    def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
+    def mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
         self._registry.mark_gone(peer)
         peer.reorder_buffer.clear()
         self._out.add(ed.SetPresence(peer.key, False))
         self._out.record(event, peer, reason)
+        self._out.add(*self._trackers.stop(peer.key))
 
-    def _forget_empty_runs(self) -> None:
+    def forget_empty_runs(self) -> None:
         for peer in self._registry.removable():
             self._forget(peer)
             self._out.save(RemoveRun(peer.key))
@@ -150,18 +180,19 @@ class RoomMembership:
         if self._registry.forget(peer):  # it was the latest of its name
             self._rate_scheduler.forget(peer.name)
         self._out.add(ed.DropRun(peer.key))
-        self.room.forget_run(peer.key)
+        self._trackers.remove(peer.key)
+        self._room.forget_run(peer.key)
 
-    def _may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
+    def may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
         """Return whether a known run may send: its credential allows it, and it is present or comes back."""
         if not event.is_authorised_for(peer.name):
-            self._count_bad_message(None, f"a key that is not authorized for '{peer.name}' used its run")
+            self._out.count_bad_message(None, f"a key that is not authorized for '{peer.name}' used its run")
             if isinstance(message, wire.Hello):  # only a hello is answered
                 reason = name_objection(peer.name, event.allowed_names or ())
                 self._out.send(event.peer_id, wire.Refused(reason))
                 self._out.record("refused", None, reason)
             return False
-        if peer.is_gone and not self._comes_back(peer, message):
+        if peer.is_gone and not self._try_readmit(peer, message):
             return False
         peer.mark_received(self._out.now_ns)
         if peer.credential != event.credential:  # it has changed, or was unknown
@@ -171,24 +202,8 @@ class RoomMembership:
                 self._out.save(SaveCredential(peer.key, event.credential))
         return True
 
-    def _send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
-        """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
-        assert finding.correction is not None
-        peer.revision += 1
-        peer.counts["corrections"] += 1
-        correction = replace(finding.correction, revision=peer.revision)
-        peer.computation.answer(correction.answered_keyframe, self._out.now_ns)
-        self._out.send(peer.id, correction)
-        answered = {"revision": peer.revision, "answers": correction.answered_keyframe}
-        self._out.record(finding.event, peer, finding.reason, is_repeat, map_id=correction.map_id, **answered)
-
-    def _send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
+    def send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
         if grant is not None and grant != peer.grant:
             self._out.send(peer.id, wire.Rate(grant.hz, self._rate_scheduler.is_windowed, grant.pose_hz))
             peer.grant = grant
-
-    def _count_bad_message(self, peer: Peer | Client | None, reason: str) -> None:
-        """Count a bad message; record the first of each peer."""
-        if (peer or self._registry.unjoined).count("bad_messages", reason, self._out.now_ns) == 1:
-            self._out.record("bad message", peer, reason, throttled=isinstance(peer, Client))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 from share.event_kinds import EventKind
+from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import MapChange
 from share.protocol.admission import RunRegistry
 from share.protocol.edge_events import EdgeEffect, SaveChanges, SendToPeer, WriteEvent
 from share.protocol.peer import Peer
+from share.protocol.room_clients import Client
 from share.timing import Throttle
 from share.wire.codec import WIRE_VERSION, encode, message_bytes
 from share.wire.messages import DownlinkMessage
@@ -129,6 +132,22 @@ class EdgeOutput:
         frames = encode(message, version)
         self._registry.sender(peer_id).counts["bytes_down"] += message_bytes(frames)
         self.add(SendToPeer(peer_id, frames))
+
+    def send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
+        """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
+        assert finding.correction is not None
+        peer.revision += 1
+        peer.counts["corrections"] += 1
+        correction = replace(finding.correction, revision=peer.revision)
+        peer.computation.answer(correction.answered_keyframe, self.now_ns)
+        self.send(peer.id, correction)
+        answered = {"revision": peer.revision, "answers": correction.answered_keyframe}
+        self.record(finding.event, peer, finding.reason, is_repeat, map_id=correction.map_id, **answered)
+
+    def count_bad_message(self, peer: Peer | Client | None, reason: str) -> None:
+        """Count a bad message; record the first of each peer."""
+        if (peer or self._registry.unjoined).count("bad_messages", reason, self.now_ns) == 1:
+            self.record("bad message", peer, reason, throttled=isinstance(peer, Client))
 
     def record(
         self, event: EventKind, peer: Named | None, reason: str, throttled: bool = True, **fields: Any

@@ -298,7 +298,7 @@ class StepChain:
         chi2 = angle_rad**2 / variance[:, 0] + distance_m**2 / variance[:, 1]
         is_false = (rows >= 0) & ~(chi2 <= _MAX_CHI2)
         is_agreed = (rows >= 0) & ~is_false
-        agreed = self._bounded(_kept(earlier, is_agreed), rows[is_agreed])
+        agreed = self._bounded(_select_rows(earlier, is_agreed), rows[is_agreed])
         if not is_false.any():
             return agreed, None
         worst = int(np.where(is_false, distance_m, -1.0).argmax())
@@ -338,6 +338,6 @@ def _variance(covs: NDArray[np.floating]) -> F64:
     return np.asarray(diagonal.reshape(-1, 2, 3).sum(axis=2))
 
 
-def _kept(earlier: EarlierPoses, is_kept: NDArray[np.bool_]) -> EarlierPoses:
+def _select_rows(earlier: EarlierPoses, is_kept: NDArray[np.bool_]) -> EarlierPoses:
     rows = np.flatnonzero(is_kept).tolist()
     return earlier if len(rows) == len(earlier) else earlier.take(rows, earlier.ids[rows].tolist())

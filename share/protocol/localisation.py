@@ -9,6 +9,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.se3 import compose_cov, inverse, position_sigma
+from share.mapping.localisation_gate import AHEAD_M
 from share.metrics.local_error import WINDOW_S
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import LedgerEntry
@@ -18,10 +19,9 @@ from share.timing import SECOND_NS, seconds_to_ns
 from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
 
-_AHEAD_M = 3.0  # what a wearer looks at; a rotation moves it by this lever
 # The body and what is so far ahead move by at most this speed relative to odometry: 1 mm a frame at 15 Hz;
 # faster, but less than 3 mm, where the way is long.
-_SPEED_M_S, _WAY_S, _MAX_SPEED_M_S = 0.0148, 10.0, 0.044
+_SPEED_M_S, _LONG_MOTION_S, _MAX_SPEED_M_S = 0.0148, 10.0, 0.044
 JUMP_M = 1.0  # a longer way is a mistake of the map that was undone: the pose jumps
 _SETTLED_M, _ARRIVED_M = 1e-3, 1e-6  # of the way left
 _MAX_FRAME_S = 0.1  # a frame after a gap moves the pose no further than one after this time
@@ -50,13 +50,13 @@ class MapFrame:
         elapsed_s, self._advanced_ns = max(0, now_ns - self._advanced_ns) / SECOND_NS, now_ns
         if self._current is None or self._target is None or self._current is self._target:
             return None
-        xi = _way(self._current, self._target, T_odom_body)
+        xi = _body_motion(self._current, self._target, T_odom_body)
         length_m = _length_m(xi)
         if length_m <= _ARRIVED_M:
             self._current = self._target
             return None
         elapsed_s = min(elapsed_s, _MAX_FRAME_S)
-        speed = min(max(_SPEED_M_S, length_m / _WAY_S), _MAX_SPEED_M_S)
+        speed = min(max(_SPEED_M_S, length_m / _LONG_MOTION_S), _MAX_SPEED_M_S)
         share = min(-math.expm1(-elapsed_s / self._time_constant_s), speed * elapsed_s / length_m)
         moved = self._current @ T_odom_body @ se3.exp(share * xi)
         self._current = se3.orthonormal(moved @ inverse(T_odom_body))
@@ -85,12 +85,14 @@ class MapFrame:
     def apply(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
         """Set a new target. Return whether the pose jumps to it."""
         target, is_same_map = correction.T_map_odom, correction.map_id == self.map_id
-        way_m = 0.0 if self._current is None else _length_m(_way(self._current, target, T_odom_body))
-        jumps = self._current is None or not is_same_map or way_m > JUMP_M
+        motion_m = (
+            0.0 if self._current is None else _length_m(_body_motion(self._current, target, T_odom_body))
+        )
+        jumps = self._current is None or not is_same_map or motion_m > JUMP_M
         self._target, self._cov, self.map_id = target, correction.cov, correction.map_id
         if jumps or self._current is None:
             self._current, self._unsettled_since_ns = target, None
-        elif way_m <= _SETTLED_M:
+        elif motion_m <= _SETTLED_M:
             self._unsettled_since_ns = None  # a correction that was taken back
         elif self._unsettled_since_ns is None:
             self._unsettled_since_ns = now_ns
@@ -101,14 +103,14 @@ class MapFrame:
         self._target = self._current = self._unsettled_since_ns = None
 
 
-def _way(T_old: F64, T_new: F64, T_odom_body: F64) -> F64:
+def _body_motion(T_old: F64, T_new: F64, T_odom_body: F64) -> F64:
     """Return the motion (6,) of the body from one T_map_odom to another, on the right."""
     return se3.log(inverse(T_old @ T_odom_body) @ T_new @ T_odom_body)
 
 
 def _length_m(xi: F64) -> float:
     """Return how far a motion (6,) of the body moves the body and what is ahead of it, at most."""
-    return float(np.linalg.norm(xi[3:]) + _AHEAD_M * np.linalg.norm(xi[:3]))
+    return float(np.linalg.norm(xi[3:]) + AHEAD_M * np.linalg.norm(xi[:3]))
 
 
 _MAX_SETTLED = 1000

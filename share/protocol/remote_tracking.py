@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
-from share.event_kinds import EventKind
+from share.config import Config
 from share.geometry import rig_check
 from share.geometry.camera import Rig
 from share.protocol import edge_events as ed
 from share.protocol.edge import Edge
+from share.protocol.edge_membership import RunTrackers
 from share.protocol.peer import Peer
 from share.protocol.streaming import FrameWindow
 from share.types import Frame
@@ -121,16 +122,54 @@ def tracker_bytes(rig: Rig) -> int:
     return 100_000_000 + 32 * rig.cam0.width * rig.cam0.height
 
 
+class RemoteTrackers(RunTrackers):
+    """A tracker for each run. capacity: runs beyond it are refused; None: no limit. frame_window: frames
+    of an agent that may wait."""
+
+    tracks_agents = True
+
+    def __init__(self, frame_window: int, capacity: TrackingCapacity | None) -> None:
+        self._frame_window, self._capacity = frame_window, capacity
+        self._trackers: dict[str, RemoteTracker] = {}  # by the key of the run
+
+    def __getitem__(self, key: str) -> RemoteTracker:
+        return self._trackers[key]
+
+    def objection(self, key: str | None, rig: Rig) -> str | None:
+        if key is None and (reason := rig_check.rig_problem(rig)) is not None:
+            return reason
+        others = [one.rig for one in self._trackers.values() if one.is_running and one.key != key]
+        return None if self._capacity is None else self._capacity.objection(others, rig)
+
+    def add(self, key: str, rig: Rig) -> None:
+        self._trackers[key] = RemoteTracker(key, rig, FrameWindow(self._frame_window))
+
+    def remove(self, key: str) -> None:
+        del self._trackers[key]
+
+    def start(self, key: str) -> Sequence[ed.TrackerEffect]:
+        return self._trackers[key].start()
+
+    def stop(self, key: str) -> Sequence[ed.TrackerEffect]:
+        return self._trackers[key].stop()
+
+    def is_ready(self, key: str) -> bool:
+        return self._trackers[key].is_ready
+
+
 class TrackingEdge(Edge):
     """An `Edge` without mapper and map writer. It emits `TrackerEffect` and takes `TrackerEvent`. capacity:
     agents beyond it are refused; None: no limit."""
 
-    tracks_agents: ClassVar[bool] = True
-
-    def __init__(self, *args: Any, capacity: TrackingCapacity | None = None, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self._capacity = capacity
-        self._trackers: dict[str, RemoteTracker] = {}  # by the key of the run
+    def __init__(
+        self,
+        config: Config,
+        session: int,
+        began_ns: int | None = None,
+        capacity: TrackingCapacity | None = None,
+    ) -> None:
+        self._trackers = RemoteTrackers(config.stream.window, capacity)
+        super().__init__(config, session, began_ns=began_ns, trackers=self._trackers)
 
     def _dispatch(self, event: ed.EdgeEvent) -> None:
         match event:
@@ -148,7 +187,7 @@ class TrackingEdge(Edge):
         match event:
             case ed.TrackerReady():
                 tracker.is_ready = True
-                self._welcome(peer)
+                self._membership.welcome(peer)
             case ed.TrackerAnswered():
                 peer.status.add_pose(event.result.state, self._out.now_ns)
                 self._out.send(peer.id, event.result)
@@ -170,50 +209,9 @@ class TrackingEdge(Edge):
                 try:
                     self._out.add(*self._trackers[peer.key].offer_frame(message, self._out.now_ns))
                 except ValueError as error:
-                    self._count_bad_message(peer, str(error))
+                    self._out.count_bad_message(peer, str(error))
             case _:
                 peer.counts["unexpected"] += 1
-
-    def _objection(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> str | None:
-        existing = self._registry.get(event.peer_id)
-        return (
-            super()._objection(event, hello)
-            or (rig_check.rig_problem(hello.rig) if existing is None else None)
-            or self._tracking_objection(None if existing is None else existing.key, hello.rig)
-        )
-
-    def _tracking_objection(self, key: str | None, rig: Rig) -> str | None:
-        """Return why no tracker can start for this run (key None: a new run); None if one can."""
-        others = [one.rig for one in self._trackers.values() if one.is_running and one.key != key]
-        return None if self._capacity is None else self._capacity.objection(others, rig)
-
-    def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
-        peer = super()._join(event, hello)
-        window = FrameWindow(self._config.stream.window)
-        self._trackers[peer.key] = RemoteTracker(peer.key, hello.rig, window)
-        return peer
-
-    def _forget(self, peer: Peer) -> None:
-        super()._forget(peer)
-        del self._trackers[peer.key]
-
-    def _welcome(self, peer: Peer) -> None:
-        """Send the welcome now, or as soon as the tracker is ready."""
-        tracker = self._trackers[peer.key]
-        self._out.add(*tracker.start())
-        if tracker.is_ready:
-            super()._welcome(peer)
-
-    def _capacity_objection(self, peer: Peer) -> str | None:
-        return super()._capacity_objection(peer) or self._tracking_objection(peer.key, peer.hello.rig)
-
-    def _readmit(self, peer: Peer) -> None:
-        super()._readmit(peer)
-        self._out.add(*self._trackers[peer.key].start())
-
-    def _mark_gone(self, peer: Peer, event: EventKind, reason: str) -> None:
-        super()._mark_gone(peer, event, reason)
-        self._out.add(*self._trackers[peer.key].stop())
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         return super()._peer_report(peer) | self._trackers[peer.key].report()

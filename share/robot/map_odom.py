@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+from share.mapping.localisation_gate import AHEAD_M
 from share.robot import robot_events as ev
 from share.robot.planar import PlanarPose, flattened, wrapped
 from share.robot.settings import RobotSettings
@@ -21,7 +22,7 @@ _MAX_PENDING = 16  # poses that wait for odometry: half a second at 30 Hz
 _REORDERED = (
     64  # a sequence number so much lower is of a late datagram, one still lower of an agent begun anew
 )
-_AHEAD_M, _MOVED_M = 3.0, 0.5  # a map moved if the robot and what is ahead of it did by more
+_MOVED_M = 0.5  # a map moved if the robot and what is ahead of it did by more
 _SIMULATED_NS = seconds_to_ns(1e8)  # a clock before 1973 is a simulation's
 
 
@@ -122,7 +123,7 @@ class MapOdom:
         if before is None or (T_odom_base := self._odometry.newest) is None:
             return None
         old, new = before @ T_odom_base, T_map_odom @ T_odom_base
-        way_m = old.distance_m(new) + _AHEAD_M * abs(wrapped(new.yaw - old.yaw))
+        way_m = old.distance_m(new) + AHEAD_M * abs(wrapped(new.yaw - old.yaw))
         return MapMoved(f"a correction moved the map by {way_m:.1f} m") if way_m > _MOVED_M else None
 
     # ------------------------------------------------------------ out

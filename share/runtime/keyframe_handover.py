@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from share.protocol.edge_events import AddKeyframe
 from share.protocol.keyframe_intake import FairQueue
 
-_MAX_UNDER_WAY = 32  # keyframes sent to the mapper and not added yet: some 30 ms of its work
+_MAX_IN_FLIGHT = 32  # keyframes sent to the mapper and not added yet: some 30 ms of its work
 
 
 @dataclass(frozen=True)
@@ -26,23 +26,23 @@ class KeyframeHandover:
     """Sends keyframes to the mapper by `send`."""
 
     def __init__(self, send: Callable[[AddKeyframe], None]) -> None:
-        self._send, self._waiting, self._under_way = send, FairQueue[AddKeyframe](), 0
+        self._send, self._waiting, self._in_flight_count = send, FairQueue[AddKeyframe](), 0
 
     def add(self, effect: AddKeyframe) -> None:
         name = effect.key.rpartition("-")[0]  # `new_run_key`
         self._waiting.add(name, effect)
-        self._hand_over()
+        self._send_waiting()
 
     def record_added(self, added: KeyframesAdded) -> None:
-        self._under_way -= added.count
-        self._hand_over()
+        self._in_flight_count -= added.count
+        self._send_waiting()
 
     def flush(self) -> None:
         """Send all that waits: the mapper is about to end."""
         while (effect := self._waiting.take_next()) is not None:
             self._send(effect)
 
-    def _hand_over(self) -> None:
-        while self._under_way < _MAX_UNDER_WAY and (effect := self._waiting.take_next()) is not None:
-            self._under_way += 1
+    def _send_waiting(self) -> None:
+        while self._in_flight_count < _MAX_IN_FLIGHT and (effect := self._waiting.take_next()) is not None:
+            self._in_flight_count += 1
             self._send(effect)

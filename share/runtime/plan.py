@@ -26,7 +26,7 @@ _UPDATE_EVERY = 4  # poses come twenty times a second
 
 
 @dataclass
-class _Segment:
+class _PathSegment:
     first_keyframe: int
     path: list[tuple[float, float]] = field(default_factory=list)  # in odom
     step_m: float = _STEP_M
@@ -55,12 +55,12 @@ class _Run:
     kind: str
     T_body_cam0: F64
     keyframes: dict[int, F64] = field(default_factory=dict)  # T_odom_body
-    segments: list[_Segment] = field(default_factory=list)
+    segments: list[_PathSegment] = field(default_factory=list)
     T_odom_body: F64 | None = None  # newest
 
     def add_keyframe(self, id_: int, T_odom_body: F64, begins: bool) -> None:
         if begins or not self.segments:
-            self.segments = [*self.segments, _Segment(id_)][-_MAX_SEGMENTS:]
+            self.segments = [*self.segments, _PathSegment(id_)][-_MAX_SEGMENTS:]
             self.T_odom_body = None
         self.keyframes[id_] = T_odom_body
         if len(self.keyframes) > _KEPT_KEYFRAMES:

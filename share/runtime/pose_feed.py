@@ -181,7 +181,7 @@ _MAX_WAITING = 32  # connections that are not served yet
 _BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
 _CLOSE_S = 1.0
 _SEND_S = 5.0  # after that a reader that does not read is disconnected
-_LOOK_S = 1.0  # between looks for readers that have gone, where there is no news
+_LOOK_S = 1.0  # between checks for readers that have gone, while there is no message
 _UNSENT_BYTES = 4096  # of a reader that does not read; newer messages are left out
 _SLEEP_RATIO = 9.0  # the server's thread uses at most a tenth of a core
 
@@ -207,7 +207,7 @@ class PoseWebSocket:
         notify: Callable[[str], None] = _print_error,
     ) -> None:
         try:
-            from share.net.bounded_websocket import Door, ModestSelector, PeerLimits
+            from share.net.bounded_websocket import ModestSelector, PeerConnections, PeerLimits
         except ImportError:
             raise ShareError(install_hint("websockets", "websocket")) from None
         if bad := [one for one in origins if not re.fullmatch(r"https?://[^/\s]+", one)]:
@@ -217,7 +217,7 @@ class PoseWebSocket:
         host = parse_host(address.removeprefix(WEBSOCKET), DEFAULT_PORT, bind=True)
         self._messages = PoseMessages(agent)
         self._newest = 0, ""  # number and text
-        self._is_closed, self._is_short_told, self._readers = False, False, set[Any]()
+        self._is_closed, self._has_reported_shortage, self._readers = False, False, set[Any]()
         self._allowed: list[Any] = [None, re.compile(_LOCAL_ORIGIN), *origins]
         self._notify = notify
         family = socket.AF_INET6 if ":" in host.name else socket.AF_INET
@@ -227,10 +227,10 @@ class PoseWebSocket:
             raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
         self.host = HostPort(host.name, int(self._listener.getsockname()[1]))
         # a page's request has some kB; a reader then sends an answer to a ping now and then
-        self._door = Door(PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10))
+        self._peer_connections = PeerConnections(PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10))
         self._loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
         self._loop.set_exception_handler(self._take_loop_error)
-        self._news = asyncio.Event()  # replaced at each message
+        self._new_message = asyncio.Event()  # replaced at each message
         self._thread = threading.Thread(target=self._run, name="poses", daemon=True)
         self._thread.start()
 
@@ -253,7 +253,7 @@ class PoseWebSocket:
 
     def _wake(self) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._tell_news)
+            self._loop.call_soon_threadsafe(self._signal_new_message)
 
     # ------------------------------------------------------------------ the server's thread
 
@@ -282,26 +282,26 @@ class PoseWebSocket:
             ping_interval=PING_S,
             ping_timeout=PING_S,
             process_request=self._refuse_excess,
-            create_connection=partial(BoundedConnection, door=self._door),
+            create_connection=partial(BoundedConnection, connections=self._peer_connections),
             logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)
         while not self._is_closed:
-            await self._news.wait()
+            await self._new_message.wait()
         server.close()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSE_S):
                 await server.wait_closed()
-        self._door.abort_all()
+        self._peer_connections.abort_all()
         await server.wait_closed()
 
-    def _tell_news(self) -> None:
-        self._news.set()
+    def _signal_new_message(self) -> None:
+        self._new_message.set()
         if not self._is_closed:
-            self._news = asyncio.Event()
+            self._new_message = asyncio.Event()
 
     def _refuse_excess(self, connection: Any, _request: Any) -> Any:
-        if self._door.admit(connection):
+        if self._peer_connections.admit(connection):
             return None
         return connection.respond(503, f"{MAX_READERS} readers already\n")
 
@@ -316,7 +316,7 @@ class PoseWebSocket:
             with contextlib.suppress(ConnectionClosed):
                 while not self._is_closed and connection.state is State.OPEN:
                     if self._newest[0] == sent:
-                        await self._wait_for_news()
+                        await self._wait_for_new_message()
                         continue
                     sent, text = self._newest
                     async with asyncio.timeout(_SEND_S):
@@ -326,16 +326,16 @@ class PoseWebSocket:
         finally:
             self._readers.discard(connection)
 
-    async def _wait_for_news(self) -> None:
+    async def _wait_for_new_message(self) -> None:
         """Wait for a message, but not so long that a reader that has gone is kept."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_LOOK_S):
-                await self._news.wait()
+                await self._new_message.wait()
 
     def _take_loop_error(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Say once that there are no file descriptors left; the loop goes on accepting after a second."""
-        if isinstance(context.get("exception"), OSError) and not self._is_short_told:
-            self._is_short_told = True
+        if isinstance(context.get("exception"), OSError) and not self._has_reported_shortage:
+            self._has_reported_shortage = True
             self._notify(
                 f"poses at ws://{self.host}: no new reader for now: {context['exception'].strerror}; "
                 "raise `ulimit -n`, or close what is open"

@@ -137,4 +137,4 @@ class RobotBridgeRun:
                     self._report(effect)
                 case ev.BridgeLine():
                     self._print_line(effect.text)
-                    self._commands.tell_watchers({"line": effect.text})
+                    self._commands.notify_watchers({"line": effect.text})

@@ -33,7 +33,7 @@ def command_path(domain: int, namespace: str) -> Path:
     return folder / f"{name}.sock"
 
 
-class _Connection:
+class _CommandConnection:
     def __init__(self, link: socket.socket, name: str) -> None:
         self.link, self.name = link, name
         self.received, self.unsent = b"", b""
@@ -45,7 +45,7 @@ class CommandServer:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._connections: dict[str, _Connection] = {}
+        self._connections: dict[str, _CommandConnection] = {}
         self._count = 0
         self._watch_timer = PeriodicTimer(_WATCH_S)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,9 +92,9 @@ class CommandServer:
             link.setblocking(False)
             self._count += 1
             name = f"goto {self._count}"
-            self._connections[name] = _Connection(link, name)
+            self._connections[name] = _CommandConnection(link, name)
 
-    def _receive(self, connection: _Connection) -> bool:
+    def _receive(self, connection: _CommandConnection) -> bool:
         """Read what has come. Return whether the connection is open."""
         self._flush(connection)
         if connection.is_ending and not connection.unsent:
@@ -109,7 +109,7 @@ class CommandServer:
         return bool(data)
 
     def _event(
-        self, connection: _Connection, line: bytes, goal_id: Callable[[], bytes]
+        self, connection: _CommandConnection, line: bytes, goal_id: Callable[[], bytes]
     ) -> ev.RobotEvent | None:
         try:
             wish = parse_json(line)
@@ -132,7 +132,7 @@ class CommandServer:
 
     def report(self, report: ev.GoalReport) -> None:
         """Tell a commander of its goal, and all that watch."""
-        self.tell_watchers({"commander": report.commander, "goal": report.text})
+        self.notify_watchers({"commander": report.commander, "goal": report.text})
         connection = self._connections.get(report.commander)
         if connection is not None:
             form = {"goal": report.text, "is_final": report.is_final, "is_reached": report.is_reached}
@@ -144,24 +144,24 @@ class CommandServer:
         if any(one.is_watching for one in self._connections.values()) and self._watch_timer.fire_if_due(
             now_ns
         ):
-            self.tell_watchers({"state": state()})
+            self.notify_watchers({"state": state()})
 
-    def tell_watchers(self, message: dict[str, Any]) -> None:
+    def notify_watchers(self, message: dict[str, Any]) -> None:
         for connection in self._connections.values():
             if connection.is_watching:
                 self._send(connection, message)
 
-    def _send(self, connection: _Connection, message: dict[str, Any]) -> None:
+    def _send(self, connection: _CommandConnection, message: dict[str, Any]) -> None:
         connection.unsent += json.dumps(message).encode() + b"\n"
         self._flush(connection)
         if len(connection.unsent) > _MAX_UNREAD_BYTES:
             connection.is_ending, connection.unsent = True, b""
 
-    def _flush(self, connection: _Connection) -> None:
+    def _flush(self, connection: _CommandConnection) -> None:
         with contextlib.suppress(OSError):
             connection.unsent = connection.unsent[connection.link.send(connection.unsent) :]
 
-    def _drop(self, connection: _Connection) -> None:
+    def _drop(self, connection: _CommandConnection) -> None:
         self._connections.pop(connection.name, None)
         connection.link.close()
 

@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from share.config import ControlConfig
+from share.config import BASE_POLICY, ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
 from share.scheduling.room_budget import RateGrant
@@ -294,7 +294,7 @@ class RandomPolicy(SharePolicy):
 POLICIES: dict[str, type[Policy]] = {
     "share": SharePolicy,
     "share-paper": SharePaperPolicy,
-    "covins-g": CovinsGPolicy,
+    BASE_POLICY: CovinsGPolicy,
     "linear": LinearPolicy,
     "equal": EqualPolicy,
     "random": RandomPolicy,

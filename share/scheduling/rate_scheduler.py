@@ -65,7 +65,7 @@ class RateScheduler:
         """Return the names of the robots to remove so that a joining agent can be served."""
         return self._policy.displaced(agent, kind, now_ns)
 
-    def capacity_news(self, now_ns: int) -> str | None:
+    def capacity_change(self, now_ns: int) -> str | None:
         """Return a line if the room has become full, or has capacity again; None if unchanged."""
         was_full, self._is_full = self._is_full, (reason := self.full_reason(now_ns)) is not None
         return None if was_full == self._is_full else reason or "there is room again"

@@ -7,9 +7,9 @@ c + k T each. The load is L T + M (c + k T), so T = A (1 - M c) / (1 + A (L + k 
 load, so rates that follow from it do not swing.
 
 Where keyframes at the rates that all want would wait for each other for more than `FREE_WAIT_MS`, every agent
-begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as long as
-they wait for less; then only where a step gains a headset more QoE than the delay that it causes costs all. What
-a keyframe takes alone on slow air, no rate changes, so it does not count.
+begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as long
+as they wait for less; then only where a step gains a headset more QoE than the delay that it causes costs
+all. What a keyframe takes alone on slow air, no rate changes, so it does not count.
 """
 
 from __future__ import annotations
@@ -34,11 +34,13 @@ SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them in
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 # air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a keyframe's
 _MESSAGE_S, _MESSAGE_PART = 3e-4, 0.006
-OTHER_HZ = 8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
+OTHER_HZ = (
+    8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
+)
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
 MAX_LOAD = 0.95  # beyond, the formula has no meaning
-_STEP_HZ = 0.25
+STEP_HZ = 0.25  # in which rates are allocated, and rise again
 _HELD = 1.5  # how much more a step must gain another agent than one that has it already
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
@@ -64,7 +66,7 @@ class AgentAir:
     is_placed: bool = True
 
     @property
-    def elsewhere_ms(self) -> float:
+    def other_delay_ms(self) -> float:
         """Part of the delay that is not the air's, ms."""
         return max(0.0, self.delay_ms - 1e3 * self.keyframe_s)
 
@@ -145,15 +147,15 @@ class RoomBudget:
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
         """Whether not everyone can send what it wants with a wait of less than `wait_ms` for others."""
-        return _Prediction(self, is_thinned=False).waits(wait_ms)
+        return _RatePrediction(self, is_thinned=False).waits(wait_ms)
 
     def allocate(
         self, wait_ms: float = FREE_WAIT_MS, before: Mapping[str, RateGrant] | None = None
     ) -> dict[str, RateGrant]:
-        """Return what every agent may send where the air is short. before: what they have, which changes hands
-        only for a much larger gain."""
+        """Return what every agent may send where the air is short. before: what they have, which changes
+        hands only for a much larger gain."""
         held_hz = np.array([before[n].hz if before and n in before else 0.0 for n in self.agents])
-        rates = _Prediction(self, is_thinned=True).allocate(wait_ms, held_hz)
+        rates = _RatePrediction(self, is_thinned=True).allocate(wait_ms, held_hz)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
 
 
@@ -177,7 +179,7 @@ def scarce_grant(form: AgentKind, hz: float) -> RateGrant:
     return RateGrant(hz, SCARCE_POSE_HZ[form])
 
 
-class _Prediction:
+class _RatePrediction:
     """Predicts the QoE of all agents by their rates (N,), in the budget's order. is_thinned: with fewer
     poses."""
 
@@ -191,10 +193,10 @@ class _Prediction:
         self._message_load = float((pose_hz + OTHER_HZ) @ (_MESSAGE_S + _MESSAGE_PART * self._air_s))
         self._weight = np.array([_WEIGHT[form] for form in forms])
         is_headset = np.array([form is AgentKind.AR for form in forms])
-        self._comes_first = is_headset | ~is_headset.any()  # others may be delayed for it
+        self._has_priority = is_headset | ~is_headset.any()  # others may be delayed for it
         self._least_hz = np.array([agent.least_hz for agent in agents])
         self._wanted_hz = np.array([agent.wanted_hz for agent in agents])
-        self._elsewhere_ms = np.array([agent.elsewhere_ms for agent in agents])
+        self._other_delay_ms = np.array([agent.other_delay_ms for agent in agents])
         self._terms = QoeTable.of([agent.terms for agent in agents])
         self._error_cm = np.array([math.nan if a.error_cm is None else a.error_cm for a in agents])
         self._drift_cm = np.minimum([agent.drift_cm for agent in agents], self._error_cm)
@@ -205,22 +207,22 @@ class _Prediction:
         return bool(self._waits(self._load(self._wanted_hz), wait_ms))
 
     def allocate(self, wait_ms: float, held_hz: F64) -> dict[str, float]:
-        """Return the rates, Hz: least ones, then steps to whom they gain most; while waits are short, those of
-        who comes first before those of others."""
+        """Return the rates, Hz: the least ones, then a step at a time to the agent that gains most by it.
+        While waits are short, agents with priority come before others."""
         hz = self._least_hz.copy()
         while len(hz) and (load := self._load(hz)) < MAX_LOAD:
-            is_open = hz + _STEP_HZ <= self._wanted_hz
+            is_open = hz + STEP_HZ <= self._wanted_hz
             gain = self._gain(hz, load) / np.maximum(self._air_s, 1e-6)
-            gain *= np.where(hz + _STEP_HZ <= held_hz, _HELD, 1.0)
-            is_free = is_open & ~self._waits(self._capped(load + _STEP_HZ * self._air_s), wait_ms)
-            steps = is_free & self._comes_first
+            gain *= np.where(hz + STEP_HZ <= held_hz, _HELD, 1.0)
+            is_free = is_open & ~self._waits(self._capped(load + STEP_HZ * self._air_s), wait_ms)
+            steps = is_free & self._has_priority
             if not steps.any():
                 steps = is_free
             if not steps.any():
-                steps = is_open & self._comes_first & (gain > _STEP_HZ * self._cost(hz, load))
+                steps = is_open & self._has_priority & (gain > STEP_HZ * self._cost(hz, load))
             if not steps.any():
                 break
-            hz[np.argmax(np.where(steps, gain, -np.inf))] += _STEP_HZ
+            hz[np.argmax(np.where(steps, gain, -np.inf))] += STEP_HZ
         return dict(zip(self._names, hz.tolist(), strict=True))
 
     def _load(self, hz: F64) -> float:
@@ -236,7 +238,7 @@ class _Prediction:
 
     def _gain(self, hz: F64, load: float) -> F64:
         """Return what a step of its rate gains each agent (N,), weighted, at the same load."""
-        return self._weight * (self._qoe(hz + _STEP_HZ, load) - self._qoe(hz, load))
+        return self._weight * (self._qoe(hz + STEP_HZ, load) - self._qoe(hz, load))
 
     def _cost(self, hz: F64, load: float) -> float:
         """Return the QoE, weighted, that all agents together lose by a load of one more."""
@@ -244,6 +246,6 @@ class _Prediction:
 
     def _qoe(self, hz: F64, load: float) -> F64:
         """Return the QoE of each agent (N,), by its rate and the load of the air."""
-        delay_ms = self._elsewhere_ms + 1e3 * self._air_s / (1 - load)
+        delay_ms = self._other_delay_ms + 1e3 * self._air_s / (1 - load)
         growth = self._measured_hz / np.maximum(hz, 1e-3) - 1  # a random walk between keyframes
         return self._terms.qoe(delay_ms, np.sqrt(self._error_cm**2 + self._drift_cm**2 * growth))

@@ -31,7 +31,7 @@ class RoomCapacity:
     leaving: tuple[str, ...] = ()
     leaving_since_ns: int | None = None
 
-    def looked_at(self, budget: RoomBudget, now_ns: int) -> RoomCapacity:
+    def reassess(self, budget: RoomBudget, now_ns: int) -> RoomCapacity:
         """Return what the room can take now."""
         robots = [name for name, one in budget.agents.items() if one.terms.form is AgentKind.ROBOT]
         has_headset = len(robots) < len(budget.agents)
@@ -76,8 +76,8 @@ def headset_delay_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection
     if load >= MAX_LOAD:
         return math.inf
     headsets = [agent for agent in staying if agent.terms.form is AgentKind.AR]
-    elsewhere_ms = _lower_quartile(one.elsewhere_ms for one in headsets or budget.agents.values())
-    return elsewhere_ms + 1e3 * air_s / (1 - load)
+    other_delay_ms = _lower_quartile(one.other_delay_ms for one in headsets or budget.agents.values())
+    return other_delay_ms + 1e3 * air_s / (1 - load)
 
 
 def _lower_quartile(values: Iterable[float]) -> float:

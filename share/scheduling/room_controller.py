@@ -8,23 +8,46 @@ from share.scheduling.qoe import QoeParameters
 from share.scheduling.room_budget import (
     FREE_WAIT_MS,
     SILENT_S,
+    STEP_HZ,
     AgentAir,
     RateGrant,
     RoomBudget,
     first_grant,
 )
 from share.scheduling.room_capacity import RoomCapacity
-from share.scheduling.staggered_start import UNKNOWN_KEYFRAME_S, StaggeredStart
-from share.timing import seconds_to_ns
+from share.timing import SECOND_NS, seconds_to_ns
 from share.types import AgentKind
 from share.wire.messages import Evaluation
+
+UNKNOWN_KEYFRAME_S = 0.06  # default before any measurement: 30 kB at 5 Mbit/s
+MAX_HOLD_S = 2.0  # longer, and a keyframe is stale: rather on a full air
+_LEAST_SLOT_S = 0.002
+
+
+class StaggeredStart:
+    """When agents that begin together send their first keyframe: one after another, as the air takes them.
+
+    Twelve first keyframes at once make each other late, each by all of them; in turns, each by those before
+    it. An agent that joins alone starts at once. Times: the edge's clock, ns.
+    """
+
+    def __init__(self) -> None:
+        self._free_ns = 0  # when the air is done with the first keyframes that have a turn
+
+    def hold_ms(self, slot_s: float, now_ns: int) -> float:
+        """Give an agent that begins its turn, and return how far off that is, ms. slot_s: until the next
+        one's."""
+        slot_s = max(slot_s, _LEAST_SLOT_S)
+        turn_ns = min(max(now_ns, self._free_ns), now_ns + seconds_to_ns(MAX_HOLD_S))
+        self._free_ns = turn_ns + seconds_to_ns(min(slot_s, MAX_HOLD_S))
+        return 1e3 * (turn_ns - now_ns) / SECOND_NS
+
 
 _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 _STARTING_NS = 10_000_000_000  # after this time an agent without keyframes no longer reserves a share
 _STARTING_LOAD = 0.5  # of the air that is free, for all that begin
 _PLENTY = 0.75  # of the free wait: less, and the air is no longer short
-_STEP_HZ = 0.25  # rise per period of a rate that was reduced
 
 
 class RoomController:
@@ -39,7 +62,7 @@ class RoomController:
         self._cut: dict[str, tuple[float, int]] = {}  # rates that were cut, and since when they may rise
         self._start = StaggeredStart()
         self._starting: dict[str, int] = {}  # agents whose air is not known, and when they joined
-        self._capacity, self._looked_ns = RoomCapacity(), 0
+        self._capacity, self._assessed_ns = RoomCapacity(), 0
 
     def first_grant(self, form: AgentKind, now_ns: int) -> RateGrant:
         """Return what an agent may send whose air is not known: its part of what all that begin have."""
@@ -86,13 +109,13 @@ class RoomController:
             return self.first_grant(terms.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]
-        self._look_at_capacity(now_ns)
+        self._reassess_capacity(now_ns)
         if counts[0] < _SLOW_START_KEYFRAMES:
             return self.first_grant(terms.form, now_ns)
         self._starting.pop(name, None)
         if not self._is_short or name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
             self._allocate(now_ns)
-        return self._risen(name, self._grants[name], now_ns)
+        return self._limit_rise(name, self._grants[name], now_ns)
 
     def _allocate(self, now_ns: int) -> None:
         """Allot the air anew. What it takes a little more or less changes nothing: once the air is short it
@@ -111,14 +134,14 @@ class RoomController:
             for name, grant in most.items()
         }
 
-    def _risen(self, name: str, grant: RateGrant, now_ns: int) -> RateGrant:
+    def _limit_rise(self, name: str, grant: RateGrant, now_ns: int) -> RateGrant:
         """Return the grant, of which a rate that was cut rises slowly: others rise as well."""
         if self._is_short and name not in self._cut:
             self._cut[name] = grant.hz, now_ns
         if (cut := self._cut.get(name)) is None:
             return grant
         before_hz, since_ns = cut
-        hz = min(grant.hz, before_hz + _STEP_HZ * int((now_ns - since_ns) / _PERIOD_NS))
+        hz = min(grant.hz, before_hz + STEP_HZ * int((now_ns - since_ns) / _PERIOD_NS))
         if hz != before_hz or hz >= grant.hz:
             self._cut[name] = hz, now_ns
         if not self._is_short and hz >= grant.hz:
@@ -133,13 +156,13 @@ class RoomController:
         """Return the robots that have to leave for one more agent of a form, by name."""
         return self._recent_capacity(now_ns).displaced(form, now_ns)
 
-    def _look_at_capacity(self, now_ns: int) -> None:
-        if now_ns - self._looked_ns >= _PERIOD_NS:
-            self._capacity, self._looked_ns = self._capacity.looked_at(self._budget, now_ns), now_ns
+    def _reassess_capacity(self, now_ns: int) -> None:
+        if now_ns - self._assessed_ns >= _PERIOD_NS:
+            self._capacity, self._assessed_ns = self._capacity.reassess(self._budget, now_ns), now_ns
 
     def _recent_capacity(self, now_ns: int) -> RoomCapacity:
-        """Return the capacity, a new one where nobody reports any more."""
-        return self._capacity if now_ns - self._looked_ns < seconds_to_ns(SILENT_S) else RoomCapacity()
+        """Return the capacity; an empty one once no agent reports any more."""
+        return self._capacity if now_ns - self._assessed_ns < seconds_to_ns(SILENT_S) else RoomCapacity()
 
     def forget(self, name: str) -> None:
         """Drop an agent."""

@@ -23,7 +23,7 @@ from share.sensors.stamps import GAP_FACTOR, MAX_JUMP_NS, StampRepair
 from share.types import ImuBatch
 
 _DEFAULT_IMU_RANGE = ImuRange()
-_DEAD_FACTOR = 10  # a stream that lets images wait for this many times a frame's longest wait is dead
+_STALL_FACTOR = 10  # a stream that lets images wait for this many times a frame's longest wait is dead
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ def sequence_frames(measurements: Iterable[Measurement], merger: FrameMerger) ->
     """Merge measurements into frames by time.
 
     Every frame has its partner image: cam1, or depth if there is no cam1; depth beside cam1 may be missing.
-    Frames go without a dead partner if IMU or depth is alive: one that has sent nothing for _DEAD_FACTOR
+    Frames go without a dead partner if IMU or depth is alive: one that has sent nothing for _STALL_FACTOR
     times the longest wait since an image of cam0 needed it. Where cam0 pauses too, nothing is dead.
 
     Streams may be out of step by up to imu_silent_ms, and out of order within themselves by reorder_ms,
@@ -116,7 +116,7 @@ class _Buffer:
         self.newest = -(2**62)
         self.consumed_until = -(2**62)  # samples up to here are rejected
         self.awaited_ns: int | None = None  # stamp of the first image of cam0 after the newest sample
-        self.was_dead = False  # at the end of all streams
+        self.was_stalled = False  # at the end of all streams
         self._reorder_ns = reorder_ns
 
     @property
@@ -203,7 +203,7 @@ class FrameMerger:
     def finish(self) -> None:
         """Mark the end of all streams: waiting frames will get nothing more."""
         for buffer in self.buffers.values():
-            buffer.was_dead = self._is_dead(buffer)
+            buffer.was_stalled = self._has_stalled(buffer)
         for buffer in self.buffers.values():
             buffer.newest = self._newest_ns = 2**62
             buffer.awaited_ns = None
@@ -225,8 +225,8 @@ class FrameMerger:
         gives scale (depth, IMU)."""
         if not partners or partners[0] is not None:
             return False
-        other = partners[-1] is not None or (self._imu is not None and not self._is_dead(self._imu))
-        return not (other and self._is_dead(self._partners[0]))
+        other = partners[-1] is not None or (self._imu is not None and not self._has_stalled(self._imu))
+        return not (other and self._has_stalled(self._partners[0]))
 
     def _is_final(self, stamp: int) -> bool:
         """Return whether nothing can still change the frame at `stamp`, or it has waited too long."""
@@ -242,7 +242,7 @@ class FrameMerger:
         """Return whether the partner image is there, or can no longer come."""
         if buffer.complete_until > stamp + self._tolerance_ns:
             return True
-        if self._is_dead(buffer):
+        if self._has_stalled(buffer):
             return True
         index = bisect_left(buffer.items, stamp - self._tolerance_ns, key=itemgetter(0))
         return index < len(buffer.items) and buffer.items[index][0] <= min(
@@ -255,14 +255,14 @@ class FrameMerger:
         if imu is None or imu.consumed_until >= stamp:
             return True
         first = imu.first_from(stamp)
-        return (first is not None and imu.complete_until >= first) or self._is_dead(imu)
+        return (first is not None and imu.complete_until >= first) or self._has_stalled(imu)
 
-    def _is_dead(self, buffer: _Buffer) -> bool:
+    def _has_stalled(self, buffer: _Buffer) -> bool:
         """Return whether a stream has let images of cam0 wait for too long. Without images its silence says
         nothing: all of a device pauses."""
-        if buffer.was_dead or buffer.awaited_ns is None:
-            return buffer.was_dead
-        return self._newest_ns - buffer.awaited_ns > _DEAD_FACTOR * self._wait_ns
+        if buffer.was_stalled or buffer.awaited_ns is None:
+            return buffer.was_stalled
+        return self._newest_ns - buffer.awaited_ns > _STALL_FACTOR * self._wait_ns
 
     def _take_partner(self, buffer: _Buffer, stamp: int) -> Any | None:
         """Remove and return the first image within the tolerance; drop earlier ones, which are unpaired."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from share.errors import StoreError, UsageError
 from share.files.locks import lock_handle
 from share.files.reading import is_sparse, open_regular, read_bytes
-from share.files.sqlite_file import limit_untrusted, read_only_uri, shm_path, wal_path
+from share.files.sqlite_file import STEPS_PER_CHECK, limit_untrusted, read_only_uri, shm_path, wal_path
 from share.store.schema import PAGE_BYTES, first_page
 
 BUSY_S = 5.0  # how long a commit waits for a reader of another process
@@ -27,7 +27,6 @@ _FIXED_HEADER_BYTES = (*range(18), *range(20, 24), *range(44, 48), *range(52, 60
 _MAX_ROW_BYTES = 256 * 1024**2  # poses of a million keyframes take 128 MB
 _MIN_TIME_S = 10.0  # time limit for reading an empty file
 _MIN_BYTES_PER_S = 1e6  # slowest disk: adds to the time limit by file size
-_STEPS_PER_CHECK = 10_000  # of SQLite's virtual machine between two checks of the time: about 0.1 ms
 _TABLE_MARKERS = b"CREATE TABLE keyframe(", b"CREATE TABLE run_copy("  # two, to survive a flipped byte
 _INDEX_BYTES = 32_768  # by which SQLite grows the index of the log
 _FRAME_BYTES = 24  # before each page in the log
@@ -77,7 +76,7 @@ def limit_time(connection: sqlite3.Connection, path: Path) -> sqlite3.Connection
     Return `connection`."""
     limit_untrusted(connection, _MAX_ROW_BYTES)
     deadline_s = time.monotonic() + _MIN_TIME_S + path.stat().st_size / _MIN_BYTES_PER_S
-    connection.set_progress_handler(lambda: time.monotonic() > deadline_s, _STEPS_PER_CHECK)
+    connection.set_progress_handler(lambda: time.monotonic() > deadline_s, STEPS_PER_CHECK)
     return connection
 
 

@@ -52,7 +52,7 @@ def read_and_repair(path: Path) -> OpenedMap:
         return _opened(_read_intact(path))
     except DamageError:
         salvaged, renamed = salvage(path)
-        problems = _with_complaint(decode_map(salvaged), damage_text(renamed)).problems
+        problems = _with_problem(decode_map(salvaged), damage_text(renamed)).problems
         return OpenedMap(_read_intact(path), problems)
 
 
@@ -70,7 +70,7 @@ def read_only(path: Path) -> OpenedMap:
     except DamageError:
         salvaged = merge_run_copies(read_damaged(path))
         complaint = "the file is damaged; only intact rows were read"
-        return OpenedMap(salvaged, _with_complaint(decode_map(salvaged.copy()), complaint).problems)
+        return OpenedMap(salvaged, _with_problem(decode_map(salvaged.copy()), complaint).problems)
 
 
 def _opened(read_rows: ReadRows) -> OpenedMap:
@@ -133,7 +133,7 @@ def _read_intact(path: Path) -> ReadRows:
     return read_rows
 
 
-def _with_complaint(loaded: StoredMap, complaint: str) -> StoredMap:
+def _with_problem(loaded: StoredMap, complaint: str) -> StoredMap:
     nothing_lost = () if loaded.problems else ("nothing is lost",)
     return replace(loaded, problems=(complaint, *loaded.problems, *nothing_lost))
 

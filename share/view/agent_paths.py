@@ -13,7 +13,7 @@ import numpy as np
 
 from share.geometry.se3 import inverse, rotation_angle
 from share.types import F32, F64, TrackState
-from share.view.events import KeyframeShown, PoseShown, RunShown
+from share.view.events import KeyframeArrived, PoseArrived, RunArrived
 
 KEYFRAMES_PER_CHUNK, PATH_POINTS_PER_CHUNK = 32, 128
 _PATH_STEP_M = 0.03
@@ -73,7 +73,7 @@ def _relative(one: PlacedKeyframe, other: PlacedKeyframe) -> F64 | None:
 class RunPath:
     """One run. number: names it in drawings."""
 
-    def __init__(self, number: int, shown: RunShown) -> None:
+    def __init__(self, number: int, shown: RunArrived) -> None:
         self.number, self.shown = number, shown
         self.keyframes: dict[int, PlacedKeyframe] = {}
         self.chunks: dict[int, list[PlacedKeyframe]] = {}
@@ -81,7 +81,7 @@ class RunPath:
         self.T_map_odom: F64 | None = None
         self.state = TrackState.INITIALISING
         self.is_current = True  # the edge receives its messages, and it is not LOST
-        self._pose: PoseShown | None = None
+        self._pose: PoseArrived | None = None
         self._count = 0
         self._ids: list[int] = []  # of keyframes, in order
         self._segment_begin = 0  # first keyframe of the present segment
@@ -90,7 +90,7 @@ class RunPath:
 
     # Keyframes
 
-    def add_keyframe(self, shown: KeyframeShown) -> PlacedKeyframe:
+    def add_keyframe(self, shown: KeyframeArrived) -> PlacedKeyframe:
         if shown.begins_segment:
             self._segment_begin, self.T_map_odom, self._last_position = shown.key.id, None, None
         one = PlacedKeyframe(
@@ -120,25 +120,25 @@ class RunPath:
 
     def remove_keyframe(self, id_: int) -> PlacedKeyframe | None:
         """Remove a keyframe; its part of the path follows the keyframe before it."""
-        if (gone := self.keyframes.pop(id_, None)) is None:
+        if (removed := self.keyframes.pop(id_, None)) is None:
             return None
-        self.chunks[gone.chunk].remove(gone)
+        self.chunks[removed.chunk].remove(removed)
         at = bisect_left(self._ids, id_)
         del self._ids[at]
-        heir = self.keyframes[self._ids[max(0, at - 1)]] if self._ids else None
-        T_heir_gone = None if heir is None else _relative(heir, gone)
-        for chunk in gone.path_chunks & self._path.keys():
+        new_owner = self.keyframes[self._ids[max(0, at - 1)]] if self._ids else None
+        T_owner_removed = None if new_owner is None else _relative(new_owner, removed)
+        for chunk in removed.path_chunks & self._path.keys():
             points = self._path[chunk]
-            if heir is None or T_heir_gone is None:
+            if new_owner is None or T_owner_removed is None:
                 self._path[chunk] = [point for point in points if point.keyframe != id_]
                 continue
-            heir.path_chunks.add(chunk)
-            R, t = T_heir_gone[:3, :3], T_heir_gone[:3, 3]
+            new_owner.path_chunks.add(chunk)
+            R, t = T_owner_removed[:3, :3], T_owner_removed[:3, 3]
             self._path[chunk] = [
-                _PathPoint(heir.id, R @ point.position + t) if point.keyframe == id_ else point
+                _PathPoint(new_owner.id, R @ point.position + t) if point.keyframe == id_ else point
                 for point in points
             ]
-        return gone
+        return removed
 
     def remove_all(self) -> None:
         """Remove all keyframes and the path."""
@@ -149,7 +149,7 @@ class RunPath:
 
     # Pose and path
 
-    def add_pose(self, pose: PoseShown) -> int | None:
+    def add_pose(self, pose: PoseArrived) -> int | None:
         """Add the newest pose. Return the chunk of the path that it extends; None if it does not."""
         self._pose, self.state = pose, pose.state
         place = self.place()

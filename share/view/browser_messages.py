@@ -16,7 +16,7 @@ _Three = tuple[_Number, _Number, _Number]
 _Text = Annotated[str, Meta(max_length=200)]
 
 
-class _Camera(Struct, tag_field="type", tag="ViewerCameraMessage"):
+class _CameraMessage(Struct, tag_field="type", tag="ViewerCameraMessage"):
     wxyz: tuple[_Number, _Number, _Number, _Number]
     position: _Three
     fov: _Number
@@ -47,7 +47,7 @@ class _SceneClick(Struct, tag_field="type", tag="SceneNodeClickMessage"):
     owner: _Text = ""
 
 
-_decoder = msgspec.msgpack.Decoder(_Camera | _Choice | _SceneClick)
+_decoder = msgspec.msgpack.Decoder(_CameraMessage | _Choice | _SceneClick)
 
 
 def is_taken(data: Any) -> bool:

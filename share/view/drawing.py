@@ -1,11 +1,17 @@
-"""Objects that a viewer draws. An object replaces an earlier one of the same name."""
+"""Objects that a viewer draws, and how lines and frusta are made.
+
+An object replaces an earlier one of the same name.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from share.colours import Colour
 from share.types import F32, F64, AgentKind
+from share.view import events as ev
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +46,7 @@ class Marks:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """An agent: T_room_body (4, 4). half_angles: as in `RunShown`. is_current: its pose is current."""
+    """An agent: T_room_body (4, 4). half_angles: as in `RunArrived`. is_current: its pose is current."""
 
     name: str
     label: str
@@ -94,3 +100,37 @@ class Announcement:
 
 
 Drawing = Points | Lines | Marks | Body | Picture | Text | FloorGrid | Removed | Announcement
+
+
+_FRUSTUM_M = 0.12  # size of a keyframe
+_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def shifted(T: F64, offset: F64) -> F64:
+    """Return a pose (4, 4) moved by an offset (3,)."""
+    out = T.copy()
+    out[:3, 3] += offset
+    return out
+
+
+def lines(ends: F64, colour: Colour, width: float) -> Lines:
+    """Return lines, without a name, between ends (N, 2, 3)."""
+    origin = ends.reshape(-1, 3).mean(axis=0)
+    return Lines("", origin, (ends - origin).astype(np.float32), colour, width)
+
+
+def named(drawing: Lines | Text, name: str) -> Lines | Text:
+    """Return the drawing under another name."""
+    if isinstance(drawing, Text):
+        return Text(name, drawing.text, drawing.position)
+    return Lines(name, drawing.origin, drawing.segments, drawing.colour, drawing.width)
+
+
+def frusta(T: F64, run: ev.RunArrived) -> F32:
+    """Return the edges (8 N, 2, 3) of N frusta of bodies T (N, 4, 4)."""
+    size = _FRUSTUM_M * (1.0 if run.kind is AgentKind.AR else 0.8)
+    in_camera = np.vstack([np.zeros(3), np.column_stack([_CORNERS * run.half_angles, np.ones(4)]) * size])
+    in_body = in_camera @ run.T_body_cam0[:3, :3].T + run.T_body_cam0[:3, 3]
+    points = np.einsum("nij,kj->nki", T[:, :3, :3], in_body) + T[:, None, :3, 3]
+    edges = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+    return np.asarray(points[:, edges].reshape(-1, 2, 3), np.float32)

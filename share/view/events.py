@@ -1,9 +1,9 @@
-"""Input events of the live room, sent by the edge or by `share track`."""
+"""Input events of the live room, sent by the edge or by `share track`, and what sums them up."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ class SessionBegun:
 
 
 @dataclass(frozen=True, eq=False)
-class RunShown:
+class RunArrived:
     """A run of an agent. T_body_cam0 (4, 4). half_angles: tangents of half of cam0's horizontal and vertical
     field of view."""
 
@@ -35,7 +35,7 @@ class RunShown:
 
 
 @dataclass(frozen=True, eq=False)
-class KeyframeShown:
+class KeyframeArrived:
     """A keyframe. points (N, 3) float32 m, in the body. jpeg: cam0's image; empty without one."""
 
     key: KeyframeKey
@@ -46,7 +46,7 @@ class KeyframeShown:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseShown:
+class PoseArrived:
     """A run's newest pose (4, 4), relative to its keyframe `keyframe`; -1: in odom. age_ms: as in
     `PoseUpdate`; None: unknown."""
 
@@ -58,7 +58,7 @@ class PoseShown:
 
 
 @dataclass(frozen=True, eq=False)
-class CorrectionShown:
+class CorrectionArrived:
     """T_map_odom (4, 4) of a run's segment that holds the keyframe `segment_keyframe`."""
 
     run: str
@@ -120,10 +120,10 @@ class AgentsReported:
 
 RoomEvent = (
     SessionBegun
-    | RunShown
-    | KeyframeShown
-    | PoseShown
-    | CorrectionShown
+    | RunArrived
+    | KeyframeArrived
+    | PoseArrived
+    | CorrectionArrived
     | MapsSolved
     | LoopAccepted
     | LoopsRemoved
@@ -132,3 +132,65 @@ RoomEvent = (
     | DecisionMade
     | AgentsReported
 )
+
+
+MAX_KEYFRAMES = 5000  # some kB each
+
+
+class Recap:
+    """Follows the events of a session, to tell a live room that starts again what is there.
+
+    Without how it came to be: pictures are left out, and all but the newest keyframes; with a map file, the
+    room reads the older ones there.
+    """
+
+    def __init__(self) -> None:
+        self._begin(SessionBegun())
+
+    def _begin(self, session: SessionBegun) -> None:
+        self._session = session
+        self._runs: dict[str, RunArrived] = {}
+        self._keyframes: dict[KeyframeKey, KeyframeArrived] = {}
+        self._corrections: dict[str, CorrectionArrived] = {}
+        self._solved: MapsSolved | None = None
+        self._loops: dict[frozenset[KeyframeKey], LoopAccepted] = {}
+
+    def apply(self, event: RoomEvent) -> None:
+        match event:
+            case SessionBegun():
+                self._begin(event)
+            case RunArrived():
+                self._runs[event.run] = event
+            case KeyframeArrived():
+                self._keyframes[event.key] = replace(event, jpeg=b"")
+                if len(self._keyframes) > MAX_KEYFRAMES:
+                    del self._keyframes[next(iter(self._keyframes))]
+            case CorrectionArrived():
+                self._corrections[event.run] = event
+            case MapsSolved():
+                self._solved = event
+            case LoopAccepted():
+                self._loops[frozenset((event.a, event.b))] = event
+            case LoopsRemoved():
+                self._loops.pop(frozenset((event.a, event.b)), None)
+            case KeyframesRemoved():
+                self._remove(set(event.keys))
+            case RunRemoved():
+                self._runs.pop(event.run, None)
+                self._corrections.pop(event.run, None)
+                self._remove({key for key in self._keyframes if key.agent == event.run})
+
+    def _remove(self, keys: set[KeyframeKey]) -> None:
+        for key in keys:
+            self._keyframes.pop(key, None)
+        self._loops = {pair: loop for pair, loop in self._loops.items() if not pair & keys}
+
+    def events(self) -> Iterator[RoomEvent]:
+        """Yield the events that lead to the same room."""
+        yield self._session
+        yield from self._runs.values()
+        yield from self._keyframes.values()
+        yield from self._corrections.values()  # before what is solved, which is better known
+        if self._solved is not None:
+            yield self._solved
+        yield from self._loops.values()

@@ -24,7 +24,7 @@ from share.protocol.peer import RestoredRun
 from share.types import Keyframe
 from share.view import events as ev
 from share.view import sources
-from share.view.recap import Recap
+from share.view.events import Recap
 from share.wire.messages import Hello, PoseUpdate
 
 MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB
@@ -37,7 +37,7 @@ _MOST_AT_ONCE = 32  # with keyframes of 30 kB, 1 MB
 _COLLECT_S = 0.03  # between messages; the viewer draws fifteen times a second
 
 
-class _Keyframe(NamedTuple):
+class _QueuedKeyframe(NamedTuple):
     run: str
     keyframe: Keyframe
     rig: Rig
@@ -58,7 +58,7 @@ class ViewFeed:
         self._report: ev.AgentsReported | None = None
         self._sent_stamps: dict[str, int] = {}
         self._rigs: dict[str, Rig] = {}
-        self._runs: dict[str, ev.RunShown] = {}
+        self._runs: dict[str, ev.RunArrived] = {}
         self._left_out_before = 0  # when runs were sent
         self.left_out = 0  # entries that were dropped
         self._wake = threading.Event()
@@ -71,17 +71,17 @@ class ViewFeed:
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         """Start with what a map file holds. known: its runs, which may come back."""
         self._rigs = {run.key: run.hello.rig for run in known}
-        self._runs = {run.key: _run_shown(run.key, run.hello) for run in known}
+        self._runs = {run.key: _run_event(run.key, run.hello) for run in known}
         self._add(ev.SessionBegun(map_file))
 
     def add_effect(self, effect: EdgeEffect) -> None:
         match effect:
             case AddRun():
                 self._rigs[effect.key] = effect.hello.rig
-                self._runs[effect.key] = _run_shown(effect.key, effect.hello)
+                self._runs[effect.key] = _run_event(effect.key, effect.hello)
                 self._add(self._runs[effect.key])
             case AddKeyframe() if (rig := self._rigs.get(effect.key)) is not None:
-                self._add(_Keyframe(effect.key, effect.keyframe, rig))
+                self._add(_QueuedKeyframe(effect.key, effect.keyframe, rig))
             case DropRun():
                 for known in (self._rigs, self._runs, self._sent_stamps):
                     known.pop(effect.key, None)
@@ -118,7 +118,7 @@ class ViewFeed:
         self._add(event)
 
     def reconnect(self, connection: Connection) -> None:
-        """Go on with another viewer, which is told first what there is."""
+        """Continue with another viewer, which first receives a recap."""
         self._next_connection = connection
         self._wake.set()
 
@@ -153,7 +153,7 @@ class ViewFeed:
         self._send(END)
 
     def _send(self, events: list[ev.RoomEvent] | bytes) -> None:
-        """Send events, or the end as it is; make nothing of them where nobody receives."""
+        """Send events, or the end as it is; skip the work while there is no receiver."""
         if self._connection is not None:
             data = events if isinstance(events, bytes) else pickle.dumps(events, pickle.HIGHEST_PROTOCOL)
             try:
@@ -177,18 +177,18 @@ class ViewFeed:
         for run, pose in self._poses.items():
             if self._sent_stamps.get(run) != pose.stamp_ns:
                 self._sent_stamps[run] = pose.stamp_ns
-                yield ev.PoseShown(run, pose.state, pose.keyframe, pose.T_keyframe_body, pose.age_ms)
+                yield ev.PoseArrived(run, pose.state, pose.keyframe, pose.T_keyframe_body, pose.age_ms)
 
     def _events(self, entry: object) -> Iterator[ev.RoomEvent]:
         match entry:
-            case _Keyframe():
-                yield sources.keyframe_shown(*entry)
+            case _QueuedKeyframe():
+                yield sources.keyframe_event(*entry)
             case MapperResult():
                 for change in entry.changes:
-                    if (shown := sources.change_shown(change)) is not None:
+                    if (shown := sources.change_event(change)) is not None:
                         yield shown
                 for finding in entry.findings:
-                    if (correction := sources.finding_shown(finding)) is not None:
+                    if (correction := sources.correction_event(finding)) is not None:
                         yield correction
             case _ if isinstance(entry, ev.RoomEvent):
                 yield entry
@@ -200,8 +200,8 @@ def batched(events: Iterator[ev.RoomEvent]) -> Iterator[list[ev.RoomEvent]]:
         yield batch
 
 
-def _run_shown(run: str, hello: Hello) -> ev.RunShown:
-    return sources.run_shown(run, hello.name, hello.kind, hello.rig)
+def _run_event(run: str, hello: Hello) -> ev.RunArrived:
+    return sources.run_event(run, hello.name, hello.kind, hello.rig)
 
 
 def _decision(fields: Mapping[str, Any]) -> ev.DecisionMade:

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from share.errors import ShareError
-from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, Door, PeerLimits
+from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, PeerConnections, PeerLimits
 from share.net.http_guard import HttpGuard
 from share.view.browser_messages import is_taken
 
@@ -32,7 +32,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
     it did not: nothing is served without the guard."""
     from websockets.asyncio import server
 
-    original, door, is_guarded, is_built = server.serve, Door(_LIMITS), False, False
+    original, connections, is_guarded, is_built = server.serve, PeerConnections(_LIMITS), False, False
 
     def serve(handler: Any, _host: str, _port: int, **options: Any) -> Any:
         nonlocal is_guarded
@@ -48,7 +48,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
             refusal = guard.check(request.path, headers)
             if refusal is not None:
                 response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
-            elif "upgrade" in headers and not door.admit(connection):
+            elif "upgrade" in headers and not connections.admit(connection):
                 response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
             elif (response := respond(connection, request)) is not None:
                 lines = guard.cookie_headers()
@@ -65,7 +65,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
             "max_size": _MAX_MESSAGE_BYTES,
             "backlog": BACKLOG,
             "open_timeout": HANDSHAKE_S,
-            "create_connection": partial(_BrowserConnection, door=door),
+            "create_connection": partial(_BrowserConnection, connections=connections),
         }
         return original(handler, sock=listener, **options | ours)
 

@@ -14,18 +14,18 @@ from share.view import events as ev
 from share.view.room import LastCorrection, Room
 
 _MOST_LIMITS = 5.0  # height of a sparkline, in limits; what is later touches its top
-_AGES_SHOWN = 150  # poses in a sparkline: ten seconds at 15 Hz
+_MAX_SPARKLINE_POSES = 150  # poses in a sparkline: ten seconds at 15 Hz
 _WIDTH, _HEIGHT = 240.0, 34.0  # px, of a sparkline
 _BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
 _NAME = f"{_DIM};padding-right:8px;vertical-align:top"
 _BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
 _SPARKLINE = "width:100%;max-width:320px;display:block;overflow:visible"
-_LINES_SHOWN = 4  # newest merges
+_MAX_MERGE_LINES = 4  # newest merges
 
 
 @dataclass
 class _AgentHistory:
-    ages_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_AGES_SHOWN))
+    ages_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_SPARKLINE_POSES))
     decision: str = ""
 
 
@@ -36,7 +36,7 @@ class SidePanel:
         self._history: dict[str, _AgentHistory] = {}  # by name
         self._names: dict[str, str] = {}  # by run
         self._report = ev.AgentsReported()
-        self._merges: deque[str] = deque(maxlen=_LINES_SHOWN)
+        self._merges: deque[str] = deque(maxlen=_MAX_MERGE_LINES)
 
     @property
     def agents(self) -> dict[str, str]:
@@ -45,16 +45,16 @@ class SidePanel:
 
     def apply(self, event: ev.RoomEvent) -> None:
         match event:
-            case ev.RunShown():
+            case ev.RunArrived():
                 self._names[event.run] = event.name
-            case ev.PoseShown() if event.age_ms is not None:
+            case ev.PoseArrived() if event.age_ms is not None:
                 self._of(self._names.get(event.run, event.run)).ages_ms.append(event.age_ms)
             case ev.DecisionMade():
                 if event.agent is not None:
                     self._of(event.agent).decision = f"{event.event}: {event.reason}"
                 if event.event in ev.MERGES:
-                    who = "" if event.agent is None else f" {event.agent}:"
-                    self._merges.append(f"{event.t_s:.1f} s {event.event}:{who} {event.reason}")
+                    name_html = "" if event.agent is None else f" {event.agent}:"
+                    self._merges.append(f"{event.t_s:.1f} s {event.event}:{name_html} {event.reason}")
             case ev.AgentsReported():
                 self._report = event
 
@@ -101,10 +101,10 @@ class SidePanel:
         )
         swatch = "rgb({}, {}, {})".format(*colour)
         is_bad = state in ("LOST", "SILENT") or bool(agent["trouble"])
-        who = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
+        name_html = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
         state_colour = "inherit" if agent["gone"] else _BAD if is_bad else _GOOD
-        how = f'<b style="color:{state_colour}">{escape(state)}</b>'
-        head = f'<div><span style="color:{swatch}">&#9632;</span> {who} {how}</div>'
+        state_html = f'<b style="color:{state_colour}">{escape(state)}</b>'
+        head = f'<div><span style="color:{swatch}">&#9632;</span> {name_html} {state_html}</div>'
         if agent["gone"]:
             return f'<div style="opacity:.5;margin:0 0 10px">{head}</div>'
         faults = "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
@@ -120,7 +120,7 @@ def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:
     if not values:
         return ""
     top = limit * min(_MOST_LIMITS, max(2.0, *(value / limit for value in values)))
-    step = _WIDTH / (_AGES_SHOWN - 1)
+    step = _WIDTH / (_MAX_SPARKLINE_POSES - 1)
     y = [_HEIGHT * (1 - min(value, top) / top) for value in values]
     points = " ".join(f"{step * k:.1f},{height:.1f}" for k, height in enumerate(y))
     limit_y = _HEIGHT * (1 - limit / top)

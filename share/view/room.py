@@ -20,10 +20,10 @@ from share.types import F64
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
+from share.view.drawing import frusta, lines, named, shifted
 from share.view.loop_lines import LoopLines, Pair
 from share.view.loop_pictures import KeyframePictures, LoopViews, nearest_to_ray
 from share.view.map_places import MapPlaces
-from share.view.shapes import frusta, lines, named, shifted
 
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
 _MAX_CHUNKS = 12  # drawn at a time
@@ -63,7 +63,7 @@ class Room:
         self._pictures: dict[str, bytes] = {}
         self._lows: dict[str, F64] = {}  # corner and floor of each chunk of keyframes: x, y, z, x, y
         self._floor: dr.FloorGrid | None = None
-        self._said: list[dr.Announcement] = []
+        self._announcements: list[dr.Announcement] = []
 
     # ------------------------------------------------------------------ events
 
@@ -71,13 +71,13 @@ class Room:
         match event:
             case ev.SessionBegun():
                 self._begin()
-            case ev.RunShown():
+            case ev.RunArrived():
                 self._add_run(event)
-            case ev.KeyframeShown():
+            case ev.KeyframeArrived():
                 self._add_keyframe(event)
-            case ev.PoseShown():
+            case ev.PoseArrived():
                 self._add_pose(event)
-            case ev.CorrectionShown():
+            case ev.CorrectionArrived():
                 self._correct(event, now_s)
             case ev.MapsSolved():
                 self._solve(event)
@@ -96,13 +96,13 @@ class Room:
             case ev.AgentsReported():
                 self._update_presence(event)
 
-    def _add_run(self, event: ev.RunShown) -> None:
+    def _add_run(self, event: ev.RunArrived) -> None:
         if event.run not in self.runs:
             self.runs[event.run] = RunPath(self._next_number, event)
             self._next_number += 1
             self._colour_numbers.setdefault(event.name, len(self._colour_numbers))
 
-    def _add_keyframe(self, event: ev.KeyframeShown) -> None:
+    def _add_keyframe(self, event: ev.KeyframeArrived) -> None:
         if (run := self.runs.get(event.key.agent)) is None or event.key.id in run.keyframes:
             return
         one = run.add_keyframe(event)
@@ -112,7 +112,7 @@ class Room:
         if one.T_map_body is not None:
             self._mark(event.key.agent, one)
 
-    def _add_pose(self, event: ev.PoseShown) -> None:
+    def _add_pose(self, event: ev.PoseArrived) -> None:
         if (run := self.runs.get(event.run)) is None:
             return
         self._moved_runs.add(event.run)
@@ -121,7 +121,7 @@ class Room:
         if (oldest := run.forget_oldest_path()) is not None:
             self._mark_path(event.run, oldest)
 
-    def _correct(self, event: ev.CorrectionShown, now_s: float) -> None:
+    def _correct(self, event: ev.CorrectionArrived, now_s: float) -> None:
         if (run := self.runs.get(event.run)) is None:
             return
         before = run.place()
@@ -196,7 +196,7 @@ class Room:
         if event.event not in ev.MERGES:
             return
         title = event.event if event.agent is None else f"{event.event}: {event.agent}"
-        self._said.append(dr.Announcement(title, event.reason))
+        self._announcements.append(dr.Announcement(title, event.reason))
         for run in reversed(self.runs.values()):
             if run.shown.name == event.agent and (place := run.place()) is not None:
                 position = place[1][:3, 3] + self._places.offset(place[0]) + (0.0, 0.0, 0.5)
@@ -244,8 +244,8 @@ class Room:
 
     def take_drawings(self, now_s: float) -> list[dr.Drawing]:
         """Return what has changed since the last call."""
-        out: list[dr.Drawing] = [*self._said]
-        self._said = []
+        out: list[dr.Drawing] = [*self._announcements]
+        self._announcements = []
         for name in [name for name, until_s in self._temporary.items() if now_s >= until_s]:
             del self._temporary[name]
             self._dirty[name] = _nothing

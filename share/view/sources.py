@@ -25,14 +25,14 @@ from share.view import events as ev
 _MAX_DEPTH_M, _MAX_DEPTH_SIGMA_M = 10.0, 0.15  # of points that are shown
 
 
-def run_shown(run: str, name: str, kind: AgentKind, rig: Rig) -> ev.RunShown:
+def run_event(run: str, name: str, kind: AgentKind, rig: Rig) -> ev.RunArrived:
     camera = rig.cam0
     half_angles = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
-    return ev.RunShown(run, name, kind, rig.T_body_cam0, half_angles)
+    return ev.RunArrived(run, name, kind, rig.T_body_cam0, half_angles)
 
 
-def keyframe_shown(run: str, keyframe: Keyframe, rig: Rig) -> ev.KeyframeShown:
-    return ev.KeyframeShown(
+def keyframe_event(run: str, keyframe: Keyframe, rig: Rig) -> ev.KeyframeArrived:
+    return ev.KeyframeArrived(
         KeyframeKey(run, keyframe.id),
         keyframe.reference < 0,
         keyframe.T_odom_body,
@@ -56,7 +56,7 @@ def _certain_points(image: KeyframeImage) -> F32:
     return points[(depth < _MAX_DEPTH_M) & (sigma_m < _MAX_DEPTH_SIGMA_M)]
 
 
-def change_shown(change: MapChange) -> ev.RoomEvent | None:
+def change_event(change: MapChange) -> ev.RoomEvent | None:
     """Return the event for a change of the map; None if it is not drawn."""
     match change:
         case SaveLoop():
@@ -70,23 +70,23 @@ def change_shown(change: MapChange) -> ev.RoomEvent | None:
     return None
 
 
-def finding_shown(finding: MapEvent) -> ev.CorrectionShown | None:
+def correction_event(finding: MapEvent) -> ev.CorrectionArrived | None:
     if finding.agent is None or (correction := finding.correction) is None:
         return None
-    return ev.CorrectionShown(
+    return ev.CorrectionArrived(
         finding.agent, correction.map_id, correction.T_map_odom, correction.segment_keyframe
     )
 
 
-def map_shown(stored: StoredMap) -> Iterator[ev.RoomEvent]:
+def map_events(stored: StoredMap) -> Iterator[ev.RoomEvent]:
     """Yield the events that lead to the map of an earlier session."""
     rigs = {}
     for run in stored.runs:
         rigs[run.run_key] = run.hello.rig
-        yield run_shown(run.run_key, run.hello.name, run.hello.kind, run.hello.rig)
+        yield run_event(run.run_key, run.hello.name, run.hello.kind, run.hello.rig)
     for one in stored.keyframes:
         if one.run_key in rigs:
-            yield keyframe_shown(one.run_key, one.keyframe, rigs[one.run_key])
+            yield keyframe_event(one.run_key, one.keyframe, rigs[one.run_key])
     if placed := map_poses(stored):
         map_ids = tuple(map_id for map_id, _ in placed.values())
         yield ev.MapsSolved(SavePoses(tuple(placed), np.array([T for _, T in placed.values()]), map_ids))
@@ -94,9 +94,9 @@ def map_shown(stored: StoredMap) -> Iterator[ev.RoomEvent]:
         yield ev.LoopAccepted(loop.a, loop.b)
 
 
-def map_file_shown(path: Path) -> Iterator[ev.RoomEvent]:
+def map_file_events(path: Path) -> Iterator[ev.RoomEvent]:
     """Yield the events that rebuild a map file's content. Raises ShareError."""
     from share.store.loading import decode_map, read_only
 
     if path.exists() and path.stat().st_size:
-        yield from map_shown(decode_map(read_only(path).rows))
+        yield from map_events(decode_map(read_only(path).rows))

@@ -26,8 +26,8 @@ class TrackedAgent:
         self._feed, self._run, self._rig = feed, name, rig
         self._segment, self._keyframes = -1, 0
         self._newest: KeyframeCandidate | None = None
-        self._told_s, self._reported_s = -_POSES_S, -_REPORT_S
-        feed.add_event(sources.run_shown(name, name, AgentKind.AR, rig))
+        self._last_pose_s, self._last_report_s = -_POSES_S, -_REPORT_S
+        feed.add_event(sources.run_event(name, name, AgentKind.AR, rig))
 
     def add(
         self, result: TrackResult, candidate: KeyframeCandidate | None, track_ms: float, now_s: float
@@ -37,14 +37,14 @@ class TrackedAgent:
             self._newest = None
         if candidate is not None:
             self._add_keyframe(candidate)
-        if result.T_odom_body is not None and now_s - self._told_s >= _POSES_S:
-            self._told_s = now_s
+        if result.T_odom_body is not None and now_s - self._last_pose_s >= _POSES_S:
+            self._last_pose_s = now_s
             T, id_ = result.T_odom_body, -1
             if self._newest is not None:
                 T, id_ = inverse(self._newest.T_odom_body) @ T, self._keyframes - 1
-            self._feed.add_event(ev.PoseShown(self._run, result.state, id_, T, track_ms))
-        if now_s - self._reported_s >= _REPORT_S:
-            self._reported_s = now_s
+            self._feed.add_event(ev.PoseArrived(self._run, result.state, id_, T, track_ms))
+        if now_s - self._last_report_s >= _REPORT_S:
+            self._last_report_s = now_s
             self._feed.add_report({"agents": {self._run: self._report(result, track_ms)}})
 
     def _report(self, result: TrackResult, track_ms: float) -> dict[str, Any]:
@@ -63,8 +63,8 @@ class TrackedAgent:
         points = sources.points_in_body(candidate.view, candidate.image, self._rig)
         key, jpeg = KeyframeKey(self._run, self._keyframes), candidate.image.jpeg.tobytes()
         self._keyframes += 1
-        self._feed.add_event(ev.KeyframeShown(key, begins, candidate.T_odom_body, points, jpeg))
+        self._feed.add_event(ev.KeyframeArrived(key, begins, candidate.T_odom_body, points, jpeg))
         if begins:
             self._segment += 1
-            place = ev.CorrectionShown(self._run, f"odom {self._segment}", np.eye(4), key.id)
+            place = ev.CorrectionArrived(self._run, f"odom {self._segment}", np.eye(4), key.id)
             self._feed.add_event(place)

@@ -244,11 +244,11 @@ class Viewer:
                     self._load(event, now_s)
 
     def _load(self, event: SessionBegun, now_s: float) -> None:
-        from share.view.sources import map_file_shown
+        from share.view.sources import map_file_events
 
         assert event.map_file is not None
         try:
-            for stored in map_file_shown(event.map_file):
+            for stored in map_file_events(event.map_file):
                 self._apply(stored, now_s)
                 self._show_that_it_runs()
         except ShareError:
@@ -262,7 +262,7 @@ class Viewer:
         if drawings := self._room.take_drawings(now_s):
             self._window.draw(drawings)
         for click in self._window.take_clicks():
-            with self._window.blaming(click.browser):
+            with self._window.disconnect_on_failure(click.browser):
                 if (views := self._room.loop_at(click.origin, click.direction)) is not None:
                     self._window.show_views(click.browser, views)
         agents = self._panel.agents

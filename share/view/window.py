@@ -245,11 +245,11 @@ class Window:
 
     def _for_each_camera(self, act: Callable[[_BrowserCamera], None]) -> None:
         for browser, camera in list(self._cameras.items()):
-            with self.blaming(browser):
+            with self.disconnect_on_failure(browser):
                 act(camera)
 
     @contextmanager
-    def blaming(self, browser: int) -> Iterator[None]:
+    def disconnect_on_failure(self, browser: int) -> Iterator[None]:
         """Disconnect a browser if what is done for it fails: it has sent something odd, or just left."""
         try:
             yield

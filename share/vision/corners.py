@@ -17,7 +17,7 @@ _MIN_EIGENVALUE = 4e-4  # above the noise of an image
 _SUPPRESSION_PX = 9  # window in which only the strongest corner is kept
 _BORDER_PX = 6
 _FAST_CONTRAST = 12
-_GRID = (8, 6)  # cells across and down
+GRID = (8, 6)  # cells across and down, over which features are spread
 
 
 def detect(image: U8, occupied_px: F32, count: int, spacing: float, mask: U8 | None = None) -> F32:
@@ -33,7 +33,7 @@ def detect(image: U8, occupied_px: F32, count: int, spacing: float, mask: U8 | N
     px, strength = _peaks(image)
     if mask is not None:
         px, strength = _masked(px, strength, mask)
-    order = spread_order(px, strength, image.shape[::-1], _GRID, occupied_px)
+    order = spread_order(px, strength, image.shape[::-1], GRID, occupied_px)
     chosen = _spaced(px[order], occupied_px, count, spacing, image.shape)
     if len(chosen) == 0:
         return np.zeros((0, 2), np.float32)

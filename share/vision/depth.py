@@ -17,6 +17,7 @@ from share.vision.patches import sample_square
 
 EDGE_RATIO = 0.05  # relative depth step within 3 x 3 px at an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
+MIN_RHO = 0.03  # 1/m; the depth of what is further away is unknown
 _DEFAULT_DEPTH_M = 3.0  # initial guess
 
 

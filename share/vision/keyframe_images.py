@@ -82,10 +82,12 @@ def decompress(image: KeyframeImage, camera: Camera) -> U8 | None:
     if not len(image.jpeg) or image_objection(image, camera) is not None:
         return None
     try:
-        decoded, complaints = with_complaints(lambda: decode_gray(image.jpeg.tobytes(), "image"))
+        decoded, decoder_warnings = capture_decoder_warnings(
+            lambda: decode_gray(image.jpeg.tobytes(), "image")
+        )
     except DataError:
         return None
-    is_intact = not complaints and decoded.shape == (camera.height, camera.width)
+    is_intact = not decoder_warnings and decoded.shape == (camera.height, camera.width)
     return decoded if is_intact else None
 
 
@@ -97,8 +99,8 @@ _STDERR = 2
 _redirecting = threading.Lock()  # file descriptors belong to the whole process
 
 
-def with_complaints(decode: Callable[[], T]) -> tuple[T, str]:
-    """Return `decode()` and what it wrote to the process's stderr, which nobody else sees.
+def capture_decoder_warnings(decode: Callable[[], T]) -> tuple[T, str]:
+    """Return `decode()` and what it wrote to the process's stderr, which is not shown.
 
     Other threads' lines of that moment count as its own: for a process whose other threads write none."""
     with _redirecting:

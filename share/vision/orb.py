@@ -8,11 +8,9 @@ import numpy as np
 from share.geometry.camera import Camera, Rig, rays
 from share.types import F32, F64, U8, Frame, KeyframeImage, View
 from share.vision import depth as depths
-from share.vision.corners import UNIFORM_FIELD_DEG, field_mask, spread_order
+from share.vision.corners import GRID, UNIFORM_FIELD_DEG, field_mask, spread_order
 
-_GRID = 8, 6  # cells across and down, over which features are spread
 _SURFACE_PX = 60.0  # a feature at most this far from one of the tracker lies on that one's surface
-_MIN_RHO = 0.03  # 1/m; the depth of what is further away is unknown
 
 
 def measures_depth(frame: Frame, rig: Rig) -> bool:
@@ -53,7 +51,7 @@ def _surface_rho(px: F32, uv: F64, camera: Camera, surfaces: KeyframeImage) -> F
     nearest = squared_px.argmin(axis=1)
     rho = (rays(uv) * surfaces.plane[nearest]).sum(axis=1)
     is_near = squared_px.min(axis=1) < _SURFACE_PX**2
-    out: F64 = np.where(is_near & (rho > _MIN_RHO), rho, np.nan)
+    out: F64 = np.where(is_near & (rho > depths.MIN_RHO), rho, np.nan)
     return out
 
 
@@ -73,7 +71,7 @@ def _detect(image: U8, count: int, mask: U8 | None = None) -> list[cv2.KeyPoint]
         return []
     px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     response = np.array([k.response for k in keypoints])
-    chosen = np.sort(spread_order(px, response, image.shape[::-1], _GRID)[:count])
+    chosen = np.sort(spread_order(px, response, image.shape[::-1], GRID)[:count])
     return [keypoints[i] for i in chosen]
 
 

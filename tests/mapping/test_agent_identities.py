@@ -419,7 +419,7 @@ def test_withdrawn_loops_are_decided_once_their_agents_are_compared():
 def test_a_decision_that_compares_many_views_is_the_last_of_its_turn():
     def decide(loop: Loop) -> LoopDecision:
         decided.append(loop)
-        atlas.loop_acceptance._overlap_check.comparison_count += 40 * (loop is loops[1])
+        atlas.overlap_check.comparison_count += 40 * (loop is loops[1])
         return LoopDecision(False, "")
 
     decided: list[Loop] = []

@@ -21,7 +21,7 @@ def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[
 
 @pytest.fixture(autouse=True)
 def two_in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(query_queue, "HURRY_CANDIDATES", 2)
+    monkeypatch.setattr(query_queue, "MAX_BACKLOG_CANDIDATES", 2)
 
 
 def search() -> CandidateSearch:

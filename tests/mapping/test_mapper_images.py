@@ -174,7 +174,7 @@ def test_a_keyframe_that_waits_is_described_for_the_queries_of_others(place: Pla
     mapper = mapper_of("ann")
     [(_, sent)] = keyframes(place, 0.0, 1, steps=1)
     mapper.add_keyframe("ann", sent)
-    while mapper._queries.next_query() is not None:
+    while mapper.queries.next_query() is not None:
         pass
     [(step, view)] = work(mapper)
     assert isinstance(step, DescribeStep) and len(view) > 200
@@ -232,12 +232,12 @@ def test_a_keyframe_may_be_removed_while_it_is_looked_up(
         mapper.finish_step(step, step.run(), 1.0)
         step = mapper.next_lookup()
     mapper.remove_keyframes([step.node_id])
-    is_removed = step.node_id not in mapper._views.by_node
+    is_removed = step.node_id not in mapper.views.by_node
     mapper.finish_step(step, ValueError("bad") if fails else step.run(), 1.0)
     rest = work(mapper)
     assert is_removed and all(other.node_id != step.node_id for other, _ in rest)
     assert mapper.report()["failed_steps"] == fails
-    assert len(mapper._views.index) == len(mapper._views.by_node) == 2
+    assert len(mapper.views.index) == len(mapper.views.by_node) == 2
 
 
 def narrow() -> tuple[Rig, KeyframeImage]:
@@ -287,7 +287,7 @@ def test_a_damaged_image_costs_the_keyframe_its_features_only_and_is_said_once(
     assert sorted(said) == [f"keyframe {k}: its image is damaged: without it" for k in (0, 1)]
     assert capfd.readouterr().err == ""
     mapper.remove_keyframes([done[0][0].node_id])
-    assert len(mapper._views.index) == len(mapper._views.by_node)
+    assert len(mapper.views.index) == len(mapper.views.by_node)
 
 
 @pytest.mark.long

@@ -9,9 +9,9 @@ from share.geometry import se3
 from share.mapping.missing_points import (
     MissingPoints,
     MissingRegions,
-    gone_regions,
     missing_points,
     missing_regions,
+    vanished_regions,
 )
 from share.mapping.recognition.verification import CameraView
 from share.types import View
@@ -82,8 +82,8 @@ def test_what_is_gone_is_of_the_old_view_only() -> None:
     query, candidate = sights(5, T_C_Q)
     where = candidate.view.uv[:, 0] > 0.1
     old = changed(candidate, where)
-    gone = gone_regions(old, query, se3.inverse(bodies(T_C_Q)))
+    gone = vanished_regions(old, query, se3.inverse(bodies(T_C_Q)))
     both = missing_regions(query, old, bodies(T_C_Q))
     assert gone.missing_share > 0.05
     assert gone.missing < both.missing
-    assert gone_regions(candidate, query, se3.inverse(bodies(T_C_Q))).missing == 0
+    assert vanished_regions(candidate, query, se3.inverse(bodies(T_C_Q))).missing == 0

@@ -88,7 +88,7 @@ class NextDay(Room):
         for i, keyframe in enumerate(a.keyframes):
             number = self.atlas.add_keyframe(a.name, keyframe)
             self.sights[number] = self.rings[0].camera_view(a.truth[i], self.rng)
-        self.atlas._overlap_check.note_restored(len(a.keyframes))
+        self.atlas.overlap_check.note_restored(len(a.keyframes))
 
     def come(self, first: int, last: int) -> list[LoopDecision]:
         """Add keyframes first .. last - 1 of b; return the decisions of the reviews."""
@@ -185,7 +185,7 @@ def test_a_copy_is_told_on_another_day_where_most_differs() -> None:
     room.come(0, 12)
     assert room.propose(room.loops(range(0, 12, 3)))[-1].accepted
     assert len(room.come(12, 40)) == 1
-    assert room.atlas.renewal.take_gone() == []
+    assert room.atlas.renewal.take_outdated() == []
 
 
 def test_keyframes_that_show_what_is_gone_leave_the_map_after_probation() -> None:
@@ -194,9 +194,9 @@ def test_keyframes_that_show_what_is_gone_leave_the_map_after_probation() -> Non
     room.propose(room.loops(range(0, 12, 3)))
     room.solve()
     room.come(12, 40)
-    assert room.atlas._overlap_check.is_on_probation(1)
-    assert room.atlas.renewal.take_gone() == []
-    room.atlas._overlap_check._probations.clear()
+    assert room.atlas.overlap_check.is_on_probation(1)
+    assert room.atlas.renewal.take_outdated() == []
+    room.atlas.overlap_check._probations.clear()
     room.come(40, 60)
-    gone = room.atlas.renewal.take_gone()
-    assert gone and room.atlas.renewal.take_gone() == []
+    gone = room.atlas.renewal.take_outdated()
+    assert gone and room.atlas.renewal.take_outdated() == []

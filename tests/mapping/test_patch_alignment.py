@@ -17,7 +17,7 @@ from share.mapping.recognition.patch_alignment import (
     ImageView,
     align_from_map,
     align_images,
-    align_unsure,
+    align_undetermined,
     align_verified,
 )
 from share.mapping.recognition.verification import Refusal, Verification
@@ -288,12 +288,12 @@ def test_a_pose_that_features_leave_uncertain_is_found_by_the_images(pairs) -> N
     true, query, candidate = pairs[0]
     near, far = true @ se3.exp(2 * OFF), true @ se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.1, 0.0]))
     for poses in ((near,), (near, true @ se3.exp(-OFF)), (near, far), (far, near)):
-        found = align_unsure(Refusal("uncertain", poses), query, candidate)
+        found = align_undetermined(Refusal("uncertain", poses), query, candidate)
         assert isinstance(found, Verification)
         assert np.linalg.norm(error(true, found.T_c_q)[3:]) < 0.0015
     for poses in ((), (far,)):
         refused = Refusal("uncertain", poses)
-        assert align_unsure(refused, query, candidate) is refused
+        assert align_undetermined(refused, query, candidate) is refused
 
 
 def test_a_pose_that_the_images_leave_uncertain_too_is_refused(
@@ -301,9 +301,9 @@ def test_a_pose_that_the_images_leave_uncertain_too_is_refused(
 ) -> None:
     true, query, candidate = pairs[0]
     refused = Refusal("uncertain", (true,))
-    assert isinstance(align_unsure(refused, query, candidate), Verification)
+    assert isinstance(align_undetermined(refused, query, candidate), Verification)
     monkeypatch.setattr(patch_alignment, "_MAX_SIGMA_DEG", 0.01)
-    assert align_unsure(refused, query, candidate) is refused
+    assert align_undetermined(refused, query, candidate) is refused
 
 
 def test_two_poses_by_which_the_images_align_are_none(pairs, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,9 +311,9 @@ def test_two_poses_by_which_the_images_align_are_none(pairs, monkeypatch: pytest
     off = true @ se3.exp(10 * OFF)
     monkeypatch.setattr(patch_alignment, "_align_from_map", lambda T, *_: verified(T))
     refused = Refusal("two poses fit", (true, off))
-    assert align_unsure(refused, query, candidate) is refused
+    assert align_undetermined(refused, query, candidate) is refused
     refused = Refusal("two poses fit", (true, true @ se3.exp(0.01 * OFF)))
-    assert align_unsure(refused, query, candidate) is not refused
+    assert align_undetermined(refused, query, candidate) is not refused
 
 
 def test_a_pose_of_the_map_that_is_far_off_is_refused(pairs) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from share.geometry import se3
 from share.mapping.loop_consistency import PLACE_M, PLACE_RAD
-from share.mapping.redundancy import TwoNearest, redundant, run_at_once
+from share.mapping.redundancy import TwoNearest, redundant, run_without_pause
 from share.types import F64
 
 
@@ -59,7 +59,7 @@ def test_the_same_are_removed_as_by_all_pairs() -> None:
         expected.append(int(rank.argmin()))
         left[expected[-1]] = False
         distance[expected[-1]], distance[:, expected[-1]] = np.inf, np.inf
-    assert run_at_once(redundant(poses, ["ann"] * 300, Counter(ann=60))) == expected
+    assert run_without_pause(redundant(poses, ["ann"] * 300, Counter(ann=60))) == expected
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.keyframe_removal import remove_keyframe
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_graph import MapGraph
-from share.mapping.redundancy import redundant, run_at_once
+from share.mapping.redundancy import redundant, run_without_pause
 from share.types import F64
 
 CONFIG = MergeConfig()
@@ -37,7 +37,7 @@ def at(x: float, yaw: float = 0.0) -> F64:
 
 def chosen(poses: F64, may_go: Collection[int], count: int, below: float = np.inf) -> list[int]:
     whose = ["ann" if k in may_go else None for k in range(len(poses))]
-    return run_at_once(redundant(poses, whose, Counter(ann=count), below))
+    return run_without_pause(redundant(poses, whose, Counter(ann=count), below))
 
 
 def test_of_similar_poses_one_stays() -> None:
@@ -67,7 +67,7 @@ def test_poses_beyond_the_distance_stay() -> None:
 def test_each_name_gives_its_quota() -> None:
     poses = np.array([at(0.01 * k) for k in range(12)])
     due = Counter(ann=2, bob=1)
-    gone = run_at_once(redundant(poses, ["ann", "bob", "eve"] * 4, due))
+    gone = run_without_pause(redundant(poses, ["ann", "bob", "eve"] * 4, due))
     assert Counter(k % 3 for k in gone) == {0: 2, 1: 1}
     assert due.total() == 0
 

@@ -121,13 +121,13 @@ def test_keyframes_that_show_what_is_gone_are_removed_with_the_next_one(tmp_path
     atlas, removed = second.mapper.atlas, [5, 6]
     keys = [atlas.key(n) for n in removed]
     second.work()
-    atlas.renewal._gone = dict.fromkeys(removed)
+    atlas.renewal._outdated = dict.fromkeys(removed)
     second.step(people[0])
     assert not {*removed} & atlas.graph.poses.keys()
     changes = [change for change in second.changes if isinstance(change, RemoveKeyframes)]
     assert {key for change in changes for key in change.keys} == {*keys}
-    assert atlas._overlap_check.is_earlier(7)
-    assert not atlas._overlap_check.is_earlier(max(atlas.graph.poses))
+    assert atlas.overlap_check.is_earlier(7)
+    assert not atlas.overlap_check.is_earlier(max(atlas.graph.poses))
 
 
 @pytest.mark.long

@@ -89,7 +89,7 @@ def test_scale_that_differs_between_the_directions_is_refused() -> None:
     stretched = View(query.view.uv, query.view.points * 2, query.view.descriptors)
     refused = verify(replace(query, view=stretched), candidate)
     assert isinstance(refused, Refusal) and refused.reason.startswith("two poses fit")
-    assert len(refused.unsure_poses) == 2
+    assert len(refused.possible_poses) == 2
 
 
 @pytest.mark.parametrize("half", [0.05])
@@ -119,7 +119,7 @@ def test_an_uncertain_pose_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     query, candidate = sights(10, T_C_Q)
     refused = verify(query, candidate)
     assert isinstance(refused, Refusal) and "pose uncertain by" in refused.reason
-    (unsure,) = refused.unsure_poses  # of the bodies
+    (unsure,) = refused.possible_poses  # of the bodies
     assert np.abs(se3.log(se3.inverse(bodies(T_C_Q)) @ unsure)).max() < 0.02
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
-from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry, spread_earlier
+from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry, select_earlier
 from share.types import Keyframe, KeyframeCandidate, View
 from share.wire.messages import Ack, Welcome
 
@@ -143,7 +143,7 @@ def test_earlier_poses_are_relative_to_keyframes_that_were_sent_by_their_ids() -
     ],
 )
 def test_earlier_poses_are_spread(known: Collection[int], kept: list[int]) -> None:
-    assert spread_earlier(reaching_back(40, *known).earlier, 40).ids.tolist() == kept
+    assert select_earlier(reaching_back(40, *known).earlier, 40).ids.tolist() == kept
 
 
 @pytest.mark.parametrize("how", ["candidate", "told"])
@@ -217,7 +217,7 @@ def test_the_resend_interval_doubles() -> None:
 
 
 def test_what_is_still_on_its_way_is_not_sent_again() -> None:
-    """A link keeps the order: while what was sent later is not answered either, a keyframe waits in a queue."""
+    """A link keeps the order: while what was sent later is not answered either, it waits in a queue."""
     book = ledger(2)
     assert due(book, S) == [0, 1]
     book.record_answer(S)  # a ping, right before them

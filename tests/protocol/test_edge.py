@@ -17,7 +17,7 @@ from share.mapping import query_queue
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.query_queue import ENOUGH_VERIFIED
+from share.mapping.query_queue import MAX_VERIFIED
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
@@ -415,13 +415,13 @@ def test_while_queries_wait_fewer_candidates_are_tried(monkeypatch):
     both.walk(40)
     config = Config()
     tried, same = {}, Verification(np.eye(4), 1e-4 * np.eye(6), 40, 30)
-    for waiting, refuse in itertools.product((0, query_queue.HURRY_WAITING), (True, False)):
+    for waiting, refuse in itertools.product((0, query_queue.MIN_BACKLOG), (True, False)):
         mapper = Mapper(config)
         mapper.add_run("ann-000b", hello(run_id=11))
         keyframes = both.keyframes("ann")
         for keyframe in keyframes[: 28 - waiting]:
             mapper.add_keyframe("ann-000b", keyframe)
-        while mapper._queries.next_query() is not None:
+        while mapper.queries.next_query() is not None:
             pass
         for keyframe in keyframes[28 - waiting : 29]:  # the last is compared by its looks
             mapper.add_keyframe("ann-000b", keyframe)
@@ -431,9 +431,9 @@ def test_while_queries_wait_fewer_candidates_are_tried(monkeypatch):
         while isinstance(verify := mapper.next_lookup(), VerifyStep):
             tried[waiting, refuse] += 1
             mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
-    assert [tried[0, True], tried[0, False]] == [config.place.candidates, ENOUGH_VERIFIED]
-    assert [tried[query_queue.HURRY_WAITING, True], tried[query_queue.HURRY_WAITING, False]] == [
-        query_queue.HURRY_CANDIDATES,
+    assert [tried[0, True], tried[0, False]] == [config.place.candidates, MAX_VERIFIED]
+    assert [tried[query_queue.MIN_BACKLOG, True], tried[query_queue.MIN_BACKLOG, False]] == [
+        query_queue.MAX_BACKLOG_CANDIDATES,
         1,
     ]
 

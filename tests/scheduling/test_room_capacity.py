@@ -30,7 +30,7 @@ def room(headsets: int, robots: int, keyframe_ms: float = KEYFRAME_MS) -> RoomBu
 
 
 def settled(budget: RoomBudget) -> RoomCapacity:
-    return RoomCapacity().looked_at(budget, 0).looked_at(budget, 10 * S)
+    return RoomCapacity().reassess(budget, 0).reassess(budget, 10 * S)
 
 
 def test_a_room_with_air_takes_everyone() -> None:
@@ -71,9 +71,9 @@ def test_an_agent_that_reports_bad_air_shuts_nobody_out(honest: int) -> None:
 
 def test_a_short_pause_refuses_nobody() -> None:
     full, free = room(23, 0), room(8, 4)
-    capacity = RoomCapacity().looked_at(full, 0)
+    capacity = RoomCapacity().reassess(full, 0)
     assert capacity.objection(AR, 9 * S) is None
-    recovered = capacity.looked_at(free, 9 * S).looked_at(full, 10 * S)
+    recovered = capacity.reassess(free, 9 * S).reassess(full, 10 * S)
     assert recovered.objection(AR, 19 * S) is None
     assert recovered.objection(AR, 20 * S) is not None
 

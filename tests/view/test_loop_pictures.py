@@ -29,10 +29,10 @@ def shade_of(data: bytes) -> tuple[float, tuple[int, ...]]:
     return float(image.mean()), image.shape
 
 
-def keyframe(name: str, id_: int, x: float, shade: int) -> ev.KeyframeShown:
+def keyframe(name: str, id_: int, x: float, shade: int) -> ev.KeyframeArrived:
     T = np.eye(4)
     T[0, 3] = x
-    return ev.KeyframeShown(
+    return ev.KeyframeArrived(
         KeyframeKey(f"{name}-1", id_), id_ == 0, T, np.zeros((0, 3), np.float32), jpeg(shade)
     )
 
@@ -42,10 +42,10 @@ def room() -> Room:
     """Ann's keyframes at x = 0 and 4, bob's at 0.5 and 4.5, and a loop of each pair."""
     room = Room()
     for name, x, shades in (("ann", 0.0, (20, 60)), ("bob", 0.5, (120, 200))):
-        room.apply(ev.RunShown(f"{name}-1", name, AgentKind.AR, np.eye(4), (0.8, 0.6)), 0.0)
+        room.apply(ev.RunArrived(f"{name}-1", name, AgentKind.AR, np.eye(4), (0.8, 0.6)), 0.0)
         room.apply(keyframe(name, 0, x, shades[0]), 0.0)
         room.apply(keyframe(name, 1, x + 4.0, shades[1]), 0.0)
-        room.apply(ev.CorrectionShown(f"{name}-1", "A", np.eye(4), 0), 0.0)
+        room.apply(ev.CorrectionArrived(f"{name}-1", "A", np.eye(4), 0), 0.0)
     for id_ in (0, 1):
         room.apply(ev.LoopAccepted(KeyframeKey("ann-1", id_), KeyframeKey("bob-1", id_)), 0.0)
     return room
@@ -115,7 +115,7 @@ class Page:
     def show_views(self, browser: int, views: loop_pictures.LoopViews) -> None:
         self.shown.append((browser, views.titles))
 
-    def blaming(self, browser: int) -> Any:
+    def disconnect_on_failure(self, browser: int) -> Any:
         return nullcontext()
 
     def draw(self, drawings: Any) -> None: ...

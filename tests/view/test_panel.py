@@ -31,7 +31,7 @@ AGENT: dict[str, Any] = {
 
 def panel_of(*events: ev.RoomEvent, now_s: float = 10.0) -> str:
     room, panel = Room(), SidePanel()
-    for event in (ev.RunShown("ann-1", "ann", AgentKind.AR, np.eye(4), (0.8, 0.6)), *events):
+    for event in (ev.RunArrived("ann-1", "ann", AgentKind.AR, np.eye(4), (0.8, 0.6)), *events):
         panel.apply(event)
         room.apply(event, 0.0)
     room.corrections["ann-1"] = LastCorrection(6.0, 0.0123)
@@ -78,7 +78,7 @@ def test_what_a_peer_says_is_text() -> None:
 
 
 def test_poses_are_a_line_below_or_above_the_limit() -> None:
-    poses = [ev.PoseShown("ann-1", TrackState.OK, 0, np.eye(4), ms) for ms in (5.0, 6.0, 90.0, 4000.0)]
+    poses = [ev.PoseArrived("ann-1", TrackState.OK, 0, np.eye(4), ms) for ms in (5.0, 6.0, 90.0, 4000.0)]
     html = panel_of(ev.AgentsReported({"ann": AGENT}), *poses)
     heights = [float(y) for _, y in re.findall(r"([\d.]+),([\d.]+)", re.search(r'points="([^"]*)"', html)[1])]  # type: ignore[index]
     limit = float(re.search(r'y1="([\d.]+)"', html)[1])  # type: ignore[index]

@@ -9,7 +9,7 @@ from share.mapping.map_changes import SavePoses
 from share.types import AgentKind
 from share.view import drawing as dr
 from share.view import events as ev
-from share.view.recap import MAX_KEYFRAMES, Recap
+from share.view.events import MAX_KEYFRAMES, Recap
 from share.view.room import Room
 
 
@@ -19,8 +19,8 @@ def at(x: float) -> np.ndarray:
     return T
 
 
-def shown(run: str, k: int) -> ev.KeyframeShown:
-    return ev.KeyframeShown(KeyframeKey(run, k), k == 0, at(k), np.ones((5, 3), np.float32), b"x" * 10**5)
+def shown(run: str, k: int) -> ev.KeyframeArrived:
+    return ev.KeyframeArrived(KeyframeKey(run, k), k == 0, at(k), np.ones((5, 3), np.float32), b"x" * 10**5)
 
 
 def drawn(events: list[ev.RoomEvent]) -> dict[str, object]:
@@ -39,9 +39,9 @@ def drawn(events: list[ev.RoomEvent]) -> dict[str, object]:
 def test_it_leads_to_the_same_room() -> None:
     events: list[ev.RoomEvent] = [ev.SessionBegun()]
     for run in ("ann", "bob", "eve"):
-        events.append(ev.RunShown(run, run, AgentKind.AR, np.eye(4), (1.0, 1.0)))
+        events.append(ev.RunArrived(run, run, AgentKind.AR, np.eye(4), (1.0, 1.0)))
         events += [shown(run, k) for k in range(40)]
-        events.append(ev.CorrectionShown(run, f"{run}/0", at(1), 0))
+        events.append(ev.CorrectionArrived(run, f"{run}/0", at(1), 0))
     keys = tuple(KeyframeKey(run, k) for run in ("ann", "bob") for k in range(20))
     events.append(ev.MapsSolved(SavePoses(keys, np.array([at(2 * k.id) for k in keys]), ("A",) * len(keys))))
     events += [ev.LoopAccepted(KeyframeKey("ann", k), KeyframeKey("bob", k)) for k in range(5)]
@@ -59,6 +59,6 @@ def test_what_is_gone_and_pictures_are_not_kept() -> None:
         recap.apply(shown("ann", k))
     recap.apply(ev.LoopAccepted(KeyframeKey("ann", 20), KeyframeKey("ann", 21)))
     recap.apply(ev.KeyframesRemoved((KeyframeKey("ann", 20),)))
-    kept = [one for one in recap.events() if isinstance(one, ev.KeyframeShown)]
+    kept = [one for one in recap.events() if isinstance(one, ev.KeyframeArrived)]
     assert len(kept) == MAX_KEYFRAMES - 1 and not any(one.jpeg for one in kept)
     assert not any(isinstance(one, ev.LoopAccepted) for one in recap.events())

@@ -24,20 +24,20 @@ def at(x: float, y: float = 0.0) -> F64:
     return T
 
 
-def run(name: str, kind: AgentKind = AgentKind.AR) -> ev.RunShown:
-    return ev.RunShown(f"{name}-1", name, kind, np.eye(4), (0.8, 0.6))
+def run(name: str, kind: AgentKind = AgentKind.AR) -> ev.RunArrived:
+    return ev.RunArrived(f"{name}-1", name, kind, np.eye(4), (0.8, 0.6))
 
 
-def keyframe(name: str, id_: int, x: float, begins: bool = False, jpeg: bytes = b"") -> ev.KeyframeShown:
-    return ev.KeyframeShown(KeyframeKey(f"{name}-1", id_), begins, at(x), POINTS, jpeg)
+def keyframe(name: str, id_: int, x: float, begins: bool = False, jpeg: bytes = b"") -> ev.KeyframeArrived:
+    return ev.KeyframeArrived(KeyframeKey(f"{name}-1", id_), begins, at(x), POINTS, jpeg)
 
 
-def corrected(name: str, map_id: str, T: F64, segment_keyframe: int = 0) -> ev.CorrectionShown:
-    return ev.CorrectionShown(f"{name}-1", map_id, T, segment_keyframe)
+def corrected(name: str, map_id: str, T: F64, segment_keyframe: int = 0) -> ev.CorrectionArrived:
+    return ev.CorrectionArrived(f"{name}-1", map_id, T, segment_keyframe)
 
 
-def pose(name: str, keyframe_id: int, x: float, state: TrackState = TrackState.OK) -> ev.PoseShown:
-    return ev.PoseShown(f"{name}-1", state, keyframe_id, at(x), 5.0)
+def pose(name: str, keyframe_id: int, x: float, state: TrackState = TrackState.OK) -> ev.PoseArrived:
+    return ev.PoseArrived(f"{name}-1", state, keyframe_id, at(x), 5.0)
 
 
 def solved(*entries: tuple[str, int, str, F64]) -> ev.MapsSolved:
@@ -180,7 +180,7 @@ def test_a_path_is_bounded() -> None:
 
 def test_agents_have_a_colour_each_which_a_new_run_keeps() -> None:
     room = Room()
-    again = ev.RunShown("ann-2", "ann", AgentKind.AR, np.eye(4), (1.0, 1.0))
+    again = ev.RunArrived("ann-2", "ann", AgentKind.AR, np.eye(4), (1.0, 1.0))
     told(room, run("ann"), run("bob"), again)
     ann, bob, ann_again = (room.colour(one) for one in room.runs.values())
     assert ann == ann_again != bob

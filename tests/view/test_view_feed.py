@@ -28,7 +28,7 @@ from share.protocol.peer import RestoredRun
 from share.types import TrackState
 from share.view import events as ev
 from share.view.feed import END, MAX_QUEUED, ViewFeed
-from share.view.sources import map_shown
+from share.view.sources import map_events
 from share.wire.messages import PoseUpdate
 
 KEY = mc.ANN
@@ -61,8 +61,8 @@ def test_runs_keyframes_and_decisions_are_told() -> None:
         AddRun(KEY, hello), AddKeyframe(KEY, keyframe), SendToPeer(b"", []), write, DropRun(KEY)
     )
     assert effects(DropRun(KEY), AddKeyframe(KEY, keyframe))[1:] == []  # of an unknown run
-    assert isinstance(run, ev.RunShown) and (run.run, run.name) == (KEY, "ann")
-    assert isinstance(shown, ev.KeyframeShown) and shown.begins_segment
+    assert isinstance(run, ev.RunArrived) and (run.run, run.name) == (KEY, "ann")
+    assert isinstance(shown, ev.KeyframeArrived) and shown.begins_segment
     assert shown.key == KeyframeKey(KEY, 0) and shown.jpeg == keyframe.image.jpeg.tobytes()
     assert said == ev.DecisionMade(1.5, "maps merged", "ann", "three loops")
     assert gone == ev.RunRemoved(KEY)
@@ -71,7 +71,7 @@ def test_runs_keyframes_and_decisions_are_told() -> None:
 def test_points_are_those_that_are_near_and_certain_in_the_body() -> None:
     keyframe = mc.keyframe(KEY, 0, points=0).keyframe
     _, shown = effects(AddRun(KEY, hello_of("ann", 1, T=mc.pose(3))), AddKeyframe(KEY, keyframe))
-    assert isinstance(shown, ev.KeyframeShown)
+    assert isinstance(shown, ev.KeyframeArrived)
     points = keyframe.image.points
     sigma_m = keyframe.image.rho_sigma * points[:, 2] ** 2
     points = points[(points[:, 2] < 10) & (sigma_m < 0.15)]
@@ -89,7 +89,7 @@ def test_what_the_mapper_decides_is_told() -> None:
     added, removed, keyframes, corrected = told(lambda feed: feed.add_result(MapperResult(findings, changes)))
     assert added == ev.LoopAccepted(loop.a, loop.b) and removed == ev.LoopsRemoved(loop.a, loop.b)
     assert keyframes == ev.KeyframesRemoved((loop.a,))
-    assert isinstance(corrected, ev.CorrectionShown) and corrected.map_id == "ann-0001/0"
+    assert isinstance(corrected, ev.CorrectionArrived) and corrected.map_id == "ann-0001/0"
     np.testing.assert_array_equal(corrected.T_map_odom, mc.pose(2))
 
 
@@ -100,7 +100,7 @@ def test_a_pose_is_told_once() -> None:
             time.sleep(0.05)
 
     poses = told(tell)
-    assert [type(one) for one in poses] == [ev.PoseShown] * 2
+    assert [type(one) for one in poses] == [ev.PoseArrived] * 2
 
 
 def test_keyframes_of_a_run_that_comes_back_are_told() -> None:
@@ -109,7 +109,7 @@ def test_keyframes_of_a_run_that_comes_back_are_told() -> None:
         feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 3).keyframe))
 
     begun, shown = told(tell)
-    assert begun == ev.SessionBegun(None) and isinstance(shown, ev.KeyframeShown)
+    assert begun == ev.SessionBegun(None) and isinstance(shown, ev.KeyframeArrived)
 
 
 def test_of_refusals_the_newest_of_each_agent_is_told() -> None:
@@ -150,7 +150,7 @@ def test_a_viewer_that_stops_reading_holds_nothing_up() -> None:
         got += pickle.loads(data)
     decisions = [one for one in got if isinstance(one, ev.DecisionMade)]
     assert decisions[-1].t_s == 2999 and len(decisions) + feed.left_out in (3000, 3001)
-    assert any(isinstance(one, ev.RunShown) for one in got)  # whatever else was dropped
+    assert any(isinstance(one, ev.RunArrived) for one in got)  # whatever else was dropped
 
 
 def test_another_viewer_is_told_what_there_is() -> None:
@@ -159,7 +159,7 @@ def test_another_viewer_is_told_what_there_is() -> None:
     feed.add_effect(AddRun(KEY, hello_of("ann", 1)))
     feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 0).keyframe))
     feed.add_poses({KEY: pose(1)})
-    while not any(isinstance(one, ev.PoseShown) for one in pickle.loads(here.recv_bytes())):
+    while not any(isinstance(one, ev.PoseArrived) for one in pickle.loads(here.recv_bytes())):
         pass
     here.close()
     feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 1).keyframe))  # while there is no viewer
@@ -172,8 +172,8 @@ def test_another_viewer_is_told_what_there_is() -> None:
     while (data := here.recv_bytes()) != END:
         got += pickle.loads(data)
     kinds = [type(one) for one in got]
-    assert kinds[:5] == [ev.SessionBegun, ev.RunShown, *[ev.KeyframeShown] * 2, ev.LoopAccepted]
-    assert kinds[-1] == ev.PoseShown
+    assert kinds[:5] == [ev.SessionBegun, ev.RunArrived, *[ev.KeyframeArrived] * 2, ev.LoopAccepted]
+    assert kinds[-1] == ev.PoseArrived
 
 
 def test_a_stored_map_is_told_with_its_poses_and_loops() -> None:
@@ -183,8 +183,8 @@ def test_a_stored_map_is_told_with_its_poses_and_loops() -> None:
         tuple(mc.kept_keyframe(mc.ANN, k) for k in range(3)),
         loops=(mc.loop(0, 2),),
     )
-    told = list(map_shown(kept))
+    told = list(map_events(kept))
     kinds = [type(one) for one in told]
-    assert kinds == [ev.RunShown, *[ev.KeyframeShown] * 3, ev.MapsSolved, ev.LoopAccepted]
+    assert kinds == [ev.RunArrived, *[ev.KeyframeArrived] * 3, ev.MapsSolved, ev.LoopAccepted]
     solved = told[4]
     assert isinstance(solved, ev.MapsSolved) and len(solved.poses.keys) == 3

@@ -88,10 +88,10 @@ def show_agent(room: LiveRoom) -> None:
     points = np.random.default_rng(1).uniform(1, 3, (20, 3)).astype(np.float32)
     key = KeyframeKey("ann-1", 0)
     for event in (
-        ev.RunShown("ann-1", "ann", AgentKind.ROBOT, np.eye(4), (0.8, 0.6)),
-        ev.KeyframeShown(key, True, np.eye(4), points, b"no image"),
-        ev.CorrectionShown("ann-1", "A", np.eye(4), 0),
-        ev.PoseShown("ann-1", TrackState.OK, 0, np.eye(4), 5.0),
+        ev.RunArrived("ann-1", "ann", AgentKind.ROBOT, np.eye(4), (0.8, 0.6)),
+        ev.KeyframeArrived(key, True, np.eye(4), points, b"no image"),
+        ev.CorrectionArrived("ann-1", "A", np.eye(4), 0),
+        ev.PoseArrived("ann-1", TrackState.OK, 0, np.eye(4), 5.0),
         ev.DecisionMade(1.0, "maps merged", "ann", "<b>three loops</b>"),
     ):
         room.feed.add_event(event)
@@ -194,7 +194,7 @@ def test_a_viewer_that_hangs_is_killed_told_and_started_again(monkeypatch: pytes
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
         for stamp_ns in range(20_000):
-            room.feed.add_event(ev.PoseShown("ann-1", TrackState.OK, 0, np.eye(4), float(stamp_ns)))
+            room.feed.add_event(ev.PoseArrived("ann-1", TrackState.OK, 0, np.eye(4), float(stamp_ns)))
         assert room.pid == pid and not told  # all that, before anybody has noticed
         monkeypatch.setattr(viewer, "MAX_SILENT_LOOKS", 3)
         os.kill(pid, signal.SIGCONT)
@@ -266,7 +266,7 @@ def test_what_one_browser_sends_ends_the_room_for_nobody(room: LiveRoom) -> None
         for k in range(30):
             pose = np.eye(4)
             pose[0, 3] = 0.1 * k
-            room.feed.add_event(ev.PoseShown("ann-1", TrackState.OK, 0, pose, 5.0))
+            room.feed.add_event(ev.PoseArrived("ann-1", TrackState.OK, 0, pose, 5.0))
             time.sleep(0.02)
         with browser(room.endpoint) as good:
             assert seen(good, "/points/0/0")
@@ -382,7 +382,7 @@ def test_a_browser_that_stops_reading_holds_up_neither_room_nor_others(room: Liv
         points = np.random.default_rng(2).uniform(1, 3, (4000, 3)).astype(np.float32)
         for k in range(1, 200):
             key = KeyframeKey("ann-1", k)
-            room.feed.add_event(ev.KeyframeShown(key, False, np.eye(4), points))
+            room.feed.add_event(ev.KeyframeArrived(key, False, np.eye(4), points))
             time.sleep(0.01)
         with browser(room.endpoint) as connection:
             assert seen(connection, "/points/0/6")

@@ -23,7 +23,13 @@ from share.types import (
     View,
 )
 from share.vision.image_codec import encode_jpeg, encode_png
-from share.vision.keyframe_images import Surfaces, compress, decompress, image_objection, with_complaints
+from share.vision.keyframe_images import (
+    Surfaces,
+    capture_decoder_warnings,
+    compress,
+    decompress,
+    image_objection,
+)
 
 CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
 
@@ -228,9 +234,9 @@ def test_stderr_is_as_it_was_after_a_decoder_fails(capfd: pytest.CaptureFixture[
         raise ValueError("no image")
 
     with pytest.raises(ValueError, match="no image"):
-        with_complaints(fails)
+        capture_decoder_warnings(fails)
     os.write(2, b"seen")
-    assert with_complaints(lambda: os.write(2, b"noticed")) == (7, "noticed")
+    assert capture_decoder_warnings(lambda: os.write(2, b"noticed")) == (7, "noticed")
     assert capfd.readouterr().err == "seen"
 
 
@@ -244,8 +250,8 @@ def test_images_are_decoded_by_several_threads_at_once() -> None:
 
 def test_an_image_is_decoded_without_a_stderr() -> None:
     code = (
-        "import numpy as np; from share.vision.keyframe_images import with_complaints;"
-        "print(with_complaints(lambda: 5))"
+        "import numpy as np; from share.vision.keyframe_images import capture_decoder_warnings;"
+        "print(capture_decoder_warnings(lambda: 5))"
     )
     done = subprocess.run(["/bin/sh", "-c", f"exec {sys.executable} -c '{code}' 2>&-"], capture_output=True)
     assert done.stdout.strip() == b"(5, '')"

@@ -34,8 +34,8 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
+from share.lab.evaluate.observed_simulation import observed_simulation  # noqa: E402
 from share.lab.evaluate.real_time import share_command  # noqa: E402
-from share.lab.evaluate.shown_simulation import shown_simulation  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.runtime.edge_observer import EdgeObserver  # noqa: E402
 from share.view.feed import ViewFeed  # noqa: E402
@@ -235,7 +235,7 @@ def play_virtually(session: Session, seconds: float, viewers: int) -> dict[str, 
     counts = list[int]()
     with closing(LiveRoom("0", None, "measured")) as live:
         observer = TimedObserver(live.feed)
-        room = shown_simulation(session, Config(), observer)
+        room = observed_simulation(session, Config(), observer)
         for _ in range(viewers):
             address = f"http://{live.endpoint}/"
             threading.Thread(target=_look_on, args=(address, counts), daemon=True).start()

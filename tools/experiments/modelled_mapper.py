@@ -248,7 +248,7 @@ class ModelledMapper:
         if self._search is None:
             return None
         number, search = self._search
-        if (candidate := search.next_candidate(self._lookups.is_hurried)) is None:
+        if (candidate := search.next_candidate(self._lookups.has_backlog)) is None:
             self._search = None
             return None
         return ModelledStep("verify", number, lambda: self._verify(number, candidate), candidate)

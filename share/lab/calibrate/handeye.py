@@ -19,7 +19,7 @@ from share.types import F64, I64
 MIN_ROTATION_RAD = np.radians(5.0)  # rms about the second axis; below, one direction is unobservable
 _MIN_MOTIONS = 10
 _ITERATIONS = 10
-_CAUCHY_SIGMAS = 2.5  # scale of Cauchy's weights, robust sigmas
+CAUCHY_SIGMAS = 2.5  # scale of Cauchy's weights, robust sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def _initial_translation(A: F64, B: F64, R: F64) -> F64:
 def _cauchy_weights(size: F64) -> F64:
     """Return Cauchy weights (N,) of residual norms, scaled by their median."""
     scale = max(float(np.median(size)), 1e-12)
-    return np.asarray(1 / (1 + (size / (_CAUCHY_SIGMAS * scale)) ** 2), np.float64)
+    return np.asarray(1 / (1 + (size / (CAUCHY_SIGMAS * scale)) ** 2), np.float64)
 
 
 def _refine(A: F64, B: F64, X: F64, rotation_rms_by_axis: F64) -> HandEye:

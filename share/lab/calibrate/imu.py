@@ -16,6 +16,7 @@ from share.types import F64, I64, ImuBatch
 
 WINDOW_S = 1.0
 MIN_REST_S = 60.0
+STANDARD_GRAVITY = 9.80665  # m/s^2
 _QUIET_QUANTILE = 0.2  # the quietest fifth gives the sensor's noise
 _MAX_NOISE_SCALE = 2.0  # times that noise within a second: more is a knock
 _MAX_SHIFT_SIGMAS = 6.0  # standard errors of the difference of two means

@@ -21,7 +21,6 @@ UNITS = {
     GYRO: dict(zip(QUANTITIES, ("rad/s/sqrt(Hz)", "rad/s", "rad/s^2/sqrt(Hz)"), strict=True)),
     ACCEL: dict(zip(QUANTITIES, ("m/s^2/sqrt(Hz)", "m/s^2", "m/s^3/sqrt(Hz)"), strict=True)),
 }
-STANDARD_GRAVITY = 9.80665
 
 
 class NoiseRow(NamedTuple):

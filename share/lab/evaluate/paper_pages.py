@@ -19,8 +19,10 @@ from share.lab.evaluate.paper_report import (
     table_of,
     trajectory_table,
 )
+from share.lab.evaluate.policy_report import ReportPictures
 from share.lab.evaluate.report import agents_csv, html_page, image_link, provenance
 from share.lab.evaluate.report_charts import draw_report
+from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.scoring import ground_truths, run_metrics
 from share.lab.evaluate.statistics import MEASURES
 from share.lab.evaluate.sweep import heat_map, sweep_table
@@ -52,13 +54,28 @@ def write_paper(
     if not any(one.conditions.policy == BASE for one in metrics):
         raise ShareError(f"{out}: no run with {BASE} succeeded; nothing to compare with")
     drift = _drift(compared)
-    pictures = draw_report(out, metrics, compared, BASE)
     everything = [*metrics, *streamed_metrics]
     parts = [
         "# The paper's tables and figures",
         f"FAILED, and not in this report: {', '.join(failed)}." if failed else "",
         provenance(everything, [*compared, *streamed]),
         table_of(summary_rows(metrics, streamed_metrics, drift, scores)),
+        *_trajectory_tables(metrics, everything),
+        *_policy_parts(out, plan, runs, trials, draw_report(out, metrics, compared, BASE)),
+        "## Estimators of the error",
+        estimator_section(scores),
+        "## Observation 2: dynamic scenes",
+        _dynamic_text(drift),
+    ]
+    text = "\n\n".join(part for part in parts if part) + "\n"
+    atomic_write(out / "agents.csv", agents_csv(everything))
+    atomic_write(out / "paper.md", text)
+    atomic_write(out / "paper.html", html_page("The paper's tables and figures", text, out))
+
+
+def _trajectory_tables(metrics: Sequence[RunMetrics], everything: Sequence[RunMetrics]) -> list[str]:
+    """Return a table of each figure by trajectory. everything: with streamed runs, which have no map."""
+    return [
         "## Latency of each trajectory, ms",
         trajectory_table(everything, "latency_ms", ".1f"),
         "## ATE in the shared map, cm",
@@ -69,6 +86,14 @@ def write_paper(
         trajectory_table(metrics, "rpe_1s_cm", ".2f"),
         "## Merges along the path, a metre",
         merges_table(metrics),
+    ]
+
+
+def _policy_parts(
+    out: Path, plan: PaperPlan, runs: PaperRuns, trials: Mapping[Path, Trial], pictures: ReportPictures
+) -> list[str]:
+    """Return the sections that compare policies and gains."""
+    return [
         pictures.timeline,
         "## Gains of the PID controller, by `share-paper`",
         *_heat_maps(out, plan, runs, trials),
@@ -77,15 +102,7 @@ def write_paper(
         "## Ablation: policies compared",
         pictures.comparison,
         pictures.agents,
-        "## Estimators of the error",
-        estimator_section(scores),
-        "## Observation 2: dynamic scenes",
-        _dynamic_text(drift),
     ]
-    text = "\n\n".join(part for part in parts if part) + "\n"
-    atomic_write(out / "agents.csv", agents_csv(everything))
-    atomic_write(out / "paper.md", text)
-    atomic_write(out / "paper.html", html_page("The paper's tables and figures", text, out))
 
 
 def _drift(trials: Sequence[Trial]) -> DriftBesideOthers:

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from share.config import STREAMED, Config
+from share.config import BASE_POLICY, STREAMED, Config
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.evaluate.campaign import PlannedRun, plan_policies
 from share.lab.evaluate.real_time import RunOptions
 from share.lab.evaluate.sweep import Axis, grid, plan_sweep
 from share.recordings.session import Session
 
-BASE, OURS, THEIRS = "covins-g", "share", "share-paper"
+BASE, OURS, THEIRS = BASE_POLICY, "share", "share-paper"
 POLICIES = (BASE, OURS, THEIRS, "linear", "equal", "random")
 LINK = "wifi5"
 GAINS = (("kp", "ki"), ("kp", "kd"), ("ki", "kd"))  # of the heat maps: rows, columns

@@ -49,15 +49,15 @@ def markdown(
     """Return the report: all policies against `base`. `failed`: names of runs that failed."""
     names = policy_names(runs)
     compared = {name: compare_policies(runs, name, base) for name in names}
-    rivals = [name for name in names if name != base]
+    other_policies = [name for name in names if name != base]
     parts = ["# Policies compared", _headline(compared, base)]
     if failed:
         parts.append(f"FAILED, and not in this report: {', '.join(failed)}.")
     parts += ["## Each policy", _values(compared), _VALUES_NOTE]
-    if rivals:
+    if other_policies:
         note = _RATIOS_NOTE + (f" {_INTERVAL_NOTE}" if _has_intervals(compared) else "")
-        parts += [f"## Ratios to `{base}`", _ratios(compared, rivals), note, pictures.comparison]
-        subject = rivals[0]  # of the first, in whatever order they are named
+        parts += [f"## Ratios to `{base}`", _ratios(compared, other_policies), note, pictures.comparison]
+        subject = other_policies[0]  # of the first, in whatever order they are named
         others = [name for name in names if name != subject]
         parts += [f"## Errors with `{subject}`", *(_win_counts(runs, subject, other) for other in others)]
     parts += ["## Every agent", pictures.agents]
@@ -73,16 +73,16 @@ def _headline(compared: _Comparisons, base: str) -> str:
     subject = next((name for name in compared if name != base), None)
     if subject is None:
         return ""
-    told = []
+    sentences = []
     for mine in compared[subject]:
         if mine.measure.name not in _HEADLINE or math.isnan(mine.ratio.value):
             continue
         unit = f" {mine.measure.unit}" if mine.measure.unit in ("ms", "cm") else ""
-        told.append(
+        sentences.append(
             f"{mine.measure.name} {format_number(mine.value.value)}{unit}, "
             f"{format_number(mine.ratio.value, '.2f')} of `{base}`'s"
         )
-    return f"**`{subject}`: {'; '.join(told)}, in the same runs.**" if told else ""
+    return f"**`{subject}`: {'; '.join(sentences)}, in the same runs.**" if sentences else ""
 
 
 def _known_measures(compared: _Comparisons) -> list[tuple[int, Measure]]:
@@ -119,16 +119,16 @@ def _has_intervals(compared: _Comparisons) -> bool:
     return any(math.isfinite(one.ratio.low) for rows in compared.values() for one in rows)
 
 
-def _ratios(compared: _Comparisons, rivals: Sequence[str]) -> str:
+def _ratios(compared: _Comparisons, other_policies: Sequence[str]) -> str:
     """Return the ratios; with intervals, and the number of pairs where not all have both values."""
     has_intervals, head = _has_intervals(compared), [""]
-    for name in rivals:
+    for name in other_policies:
         is_partly = any(0 < one.pairs < one.total_pairs for one in compared[name])
         head += [name, *(["95 %"] if has_intervals else []), *(["pairs"] if is_partly else [])]
     rows = [head]
     for k, measure in _known_measures(compared):
         row = [measure.name]
-        for name in rivals:
+        for name in other_policies:
             one = compared[name][k]
             is_partly = any(0 < other.pairs < other.total_pairs for other in compared[name])
             row.append(format_number(one.ratio.value, ".2f"))
@@ -153,7 +153,7 @@ def _win_counts(runs: Sequence[RunMetrics], name: str, other: str) -> str:
 
 
 def _agent_table(runs: Sequence[RunMetrics], names: Sequence[str], field: str) -> str:
-    """Return a table of one quantity, a row for each agent on each session; "" where nobody has it."""
+    """Return a table of one quantity, a row for each agent on each session; "" where no run has it."""
     rows = [["session", "agent", *names]]
     for session in dict.fromkeys(run.conditions.session for run in runs):
         for agent in dict.fromkeys(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_MS = 1_000_000
+MS_NS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Delay:
     def draw_ns(self, normal: float) -> int:
         """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
         sigma = math.log(max(1.0, self.p95 / self.p50)) / 1.645
-        return round(self.p50 * math.exp(sigma * normal) * _MS)
+        return round(self.p50 * math.exp(sigma * normal) * MS_NS)
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Sampled:
     def draw_ns(self, normal: float) -> int:
         """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
         below = 0.5 * (1 + math.erf(normal / math.sqrt(2)))
-        return round(float(np.interp(below * (len(self.ms) - 1), range(len(self.ms)), self.ms)) * _MS)
+        return round(float(np.interp(below * (len(self.ms) - 1), range(len(self.ms)), self.ms)) * MS_NS)
 
 
 # Keyframe work after a frame, ms; none after half of the frames. Measured on 1,301 frames of four recordings.

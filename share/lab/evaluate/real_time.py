@@ -160,15 +160,9 @@ def play_in_real_time(
         for number, (name, agent) in enumerate(session.agents.items()):
             identity = (f"{session.folder}/{name}", "--name", name, "--kind", str(agent.kind))
             destination = ("--edge", address, "--out", str(folders[name]))
-            agents[name] = stack.enter_context(
-                running_child(
-                    logs[name],
-                    "agent",
-                    *identity,
-                    *destination,
-                    *options.agent_arguments(number, links.name_for(name)),
-                )
-            )
+            terms = options.agent_arguments(number, links.name_for(name))
+            child = running_child(logs[name], "agent", *identity, *destination, *terms)
+            agents[name] = stack.enter_context(child)
         _watch(agents, _RunMonitor(folders, out / "edge" / "events.jsonl"), seconds + AGENT_GRACE_S, show)
         for name, process in {**agents, "edge": edge}.items():
             if stop_child(process) != 0:

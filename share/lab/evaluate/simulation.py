@@ -19,7 +19,7 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
-from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import MS_NS, Delay, ProcessingDelays, Sampled
 from share.lab.evaluate.shared_air import SharedAir
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
@@ -41,7 +41,6 @@ from share.wire.codec import message_bytes
 from share.wire.layouts import Bytes
 from share.wire.messages import Hello, peer_id
 
-_MS = 1_000_000
 _TICK_MS = 50
 _RANDOM_BATCH = 1000
 _ACCESS_POINT = ""  # a station beside the agents, which go by name
@@ -142,7 +141,7 @@ class Simulation:
         for member in self._members.values():
             self._to_agent(member, ev.AgentTick())
         self._to_edge(ed.EdgeTick())
-        self._schedule(_TICK_MS * _MS, self._tick)
+        self._schedule(_TICK_MS * MS_NS, self._tick)
 
     # Agents.
 
@@ -227,7 +226,7 @@ class Simulation:
 
     def _to_edge(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, self.now_ns):
-            self._edge_did(effect)
+            self._on_edge_effect(effect)
             match effect:
                 case ed.SendToPeer():
                     self._send_down(effect)
@@ -239,8 +238,8 @@ class Simulation:
                 case ed.WriteEvent():
                     self._on_record(effect.fields)
 
-    def _edge_did(self, effect: ed.EdgeEffect) -> None:
-        """An effect of the edge, for those who look on."""
+    def _on_edge_effect(self, effect: ed.EdgeEffect) -> None:
+        """Hook for observers of the edge's effects."""
 
     def _send_down(self, effect: ed.SendToPeer) -> None:
         member, frames = self._members[effect.peer_id], effect.frames
@@ -294,7 +293,7 @@ class Simulation:
             self._schedule_mapper(spent_ns, self._mapper_idle)
             return
         result = _result_or_error(step.run)
-        step_ns = self._draw(self._delay_of(step, result))
+        step_ns = self._draw(self.delay_of(step, result))
         self.mapper_busy_ns += step_ns
         self._schedule_mapper(spent_ns + step_ns, lambda: self._step_done(step, result))
 
@@ -317,7 +316,7 @@ class Simulation:
                 after_ns + solve_ns, lambda: self._send_to_mapper(self._delays.apply_solution, apply_result)
             )
 
-    def _delay_of(self, step: Any, result: object) -> Delay:
+    def delay_of(self, step: Any, result: object) -> Delay:
         delays = self._delays
         if step.kind == QueryStep.kind:
             return delays.query

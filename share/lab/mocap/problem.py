@@ -10,20 +10,20 @@ import numpy as np
 from share.errors import CalibrationMismatchError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
+from share.lab.calibrate.camera_imu.problem import BIAS_SIGMA
+from share.lab.calibrate.handeye import CAUCHY_SIGMAS
 from share.lab.least_squares import ArrowFactor, ArrowSystem, minimise
 from share.lab.mocap.factors import ImuChain, MocapObservations, imu_chain, mocap_observations
 from share.lab.mocap.state import NODE_SIZE, SHARED_SIZE, MocapFitOptions, MocapImuState
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.types import F64, ImuBatch
 
-_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: larger than any IMU's; holds unobservable biases only
 _TILT_SIGMA = 1.0  # rad: practically no prior
 CHECK = (
     "check units (m, rad/s, m/s^2), the order of quaternions (TUM: qx qy qz qw; .csv: qw qx qy qz), and that "
     "both are of one body"
 )
 _MIN_INLIER_WEIGHT = 0.2
-_CAUCHY_SIGMAS = 2.5  # scale of Cauchy's weights
 _MAX_STEPS = 50
 _CONVERGED = 1e-6  # relative decrease of the cost, far below the effect of one sigma
 
@@ -98,13 +98,13 @@ class MocapImuProblem:
 
     def _weight(self, observations: MocapObservations) -> F64:
         """Return Cauchy weights (K,) by the mean square of the six residuals."""
-        return np.asarray(1 / (1 + (observations.residual**2).mean(1) / _CAUCHY_SIGMAS**2), np.float64)
+        return np.asarray(1 / (1 + (observations.residual**2).mean(1) / CAUCHY_SIGMAS**2), np.float64)
 
     def _evaluate(self, state: MocapImuState) -> tuple[_Residuals, float]:
         chain = imu_chain(state, self.imu, self.noise, self.options.gravity, self.is_break)
         observations = self._observations(state)
-        robust_cost = -6 * _CAUCHY_SIGMAS**2 * np.log(self._weight(observations)).sum() * self.sample_weight
-        bias_prior = np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA
+        robust_cost = -6 * CAUCHY_SIGMAS**2 * np.log(self._weight(observations)).sum() * self.sample_weight
+        bias_prior = np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / BIAS_SIGMA
         prior = (self._prior_information() * self._prior_deviation(state) ** 2).sum()
         cost = float((chain.residual**2).sum() + robust_cost + (bias_prior**2).sum() + prior)
         return (chain, observations), cost
@@ -120,8 +120,8 @@ class MocapImuProblem:
         out = normal_equations(
             chain, observations, weight, self._prior_information(), self._prior_deviation(state), len(state.p)
         )
-        out.blocks[0, 0, 9:, 9:] += np.diag(_BIAS_SIGMA**-2)
-        out.g_nodes[0, 9:] -= np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA**2
+        out.blocks[0, 0, 9:, 9:] += np.diag(BIAS_SIGMA**-2)
+        out.g_nodes[0, 9:] -= np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / BIAS_SIGMA**2
         return out
 
     def _prior_information(self) -> F64:

@@ -14,13 +14,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from share.array_table import ArrayTable
-from share.lab.train.keyframe_table import KeyframeTable
+from share.lab.train.keyframe_table import MIN_CM, KeyframeTable
 from share.lab.train.network import BestWeights
 from share.types import F32, F64
 
 TREES = 70
 _BLOCKS = (2, 4)  # rows and columns of blocks of each PSD channel: 24 numbers for the forest
-_MIN_CM = 0.01
 _EPOCHS = 100
 _PATIENCE = 12
 _BATCH = 256
@@ -49,7 +48,7 @@ def linear(
     from sklearn.linear_model import LinearRegression
 
     model = LinearRegression().fit(training.table.scalars, training.table.error_cm)
-    return lambda rows: np.maximum(model.predict(rows.table.scalars), _MIN_CM)
+    return lambda rows: np.maximum(model.predict(rows.table.scalars), MIN_CM)
 
 
 def forest(
@@ -61,7 +60,7 @@ def forest(
     model = RandomForestRegressor(TREES, min_samples_leaf=3, max_features=0.3, random_state=seed, n_jobs=2)
     model.fit(forest_inputs(training), training.table.error_cm)
     model.n_jobs = 1  # a pool costs more than it gains for one keyframe
-    return lambda rows: np.maximum(model.predict(forest_inputs(rows)), _MIN_CM)
+    return lambda rows: np.maximum(model.predict(forest_inputs(rows)), MIN_CM)
 
 
 def perceptron(

@@ -18,7 +18,7 @@ from share.odometry.error_model.inputs import INPUT_SHAPES, ErrorModelInput
 from share.odometry.error_model.network import MAX_ERROR_CM
 from share.types import F32, I64, U8
 
-_MIN_CM = 0.01
+MIN_CM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ def tabulate(all_labels: Sequence[Labels]) -> KeyframeTable:
         np.concatenate([getattr(labels, name)[k] for labels, k in zip(all_labels, is_known, strict=True)])
         for name in ("error_cm", *INPUT_SHAPES)
     ]
-    return KeyframeTable(np.concatenate(run), columns[0].clip(_MIN_CM, MAX_ERROR_CM), *columns[1:])
+    return KeyframeTable(np.concatenate(run), columns[0].clip(MIN_CM, MAX_ERROR_CM), *columns[1:])
 
 
 # The split: runs that share a room or a recorded motion stay together.

@@ -27,10 +27,13 @@ def outvoted_agents(
     disagreeing, agreeing: pairs of agents. Of equals a suspect is chosen, then the agent with fewer that
     agree. The search ends where agents with different credentials rank equal.
     """
-    supporters, out, remaining = _count_votes(agreeing, credentials), set[str](), set(disagreeing)
+    agreement_counts, out, remaining = _count_votes(agreeing, credentials), set[str](), set(disagreeing)
     while remaining:
-        opponents = _count_votes((tuple(names) for names in remaining), credentials)
-        rank = {name: (count, name in suspects, -supporters[name]) for name, count in opponents.items()}
+        disagreement_counts = _count_votes((tuple(names) for names in remaining), credentials)
+        rank = {
+            name: (count, name in suspects, -agreement_counts[name])
+            for name, count in disagreement_counts.items()
+        }
         highest = {agent for agent in rank if rank[agent] == max(rank.values())}
         if len({credentials[agent] for agent in highest}) != 1:  # 0: the rest share one credential
             break

@@ -13,7 +13,7 @@ import numpy as np
 from share.geometry import se3
 from share.types import F64, Keyframe
 
-_UPRIGHT_STEP_RAD = np.radians(0.001)  # by which a solution turns a map upright: nobody in it notices
+_UPRIGHT_STEP_RAD = np.radians(0.001)  # by which a solution turns a map upright: imperceptible
 _FLOOR_DEG = 0.1  # added to sigma in quadrature: error of the IMU calibration
 
 
@@ -50,7 +50,7 @@ def turned_upright(poses: F64, gravity_factors: F64, anchor_index: int) -> F64:
     return _turned(poses, axis * (np.arctan2(length, up[2]) / length), anchor_index)
 
 
-def turned_back(poses: F64, before: F64, anchor_index: int) -> F64:
+def restore_tilt(poses: F64, before: F64, anchor_index: int) -> F64:
     """Return poses (N, 4, 4) turned about the anchor to the tilt that it had before, (N, 4, 4), but for
     `_UPRIGHT_STEP_RAD`."""
     R_before, R = before[anchor_index, :3, :3], poses[anchor_index, :3, :3]

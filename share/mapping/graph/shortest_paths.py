@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from share.types import F64, I64
 
-_FURTHEST = 1e300  # a cost that no path has; below that of a removed edge
-_MOST_GONE = 0.1  # share of removed edges in the arrays
-_WIDER = 8.0  # factor on the cost up to which a search goes, until it reaches its goals
+_MAX_COST = 1e300  # a cost that no path has; below that of a removed edge
+_MAX_REMOVED_SHARE = 0.1  # share of removed edges in the arrays
+_REACH_FACTOR = 8.0  # factor on the cost up to which a search goes, until it reaches its goals
 
 
 class ShortestPaths:
@@ -22,8 +22,8 @@ class ShortestPaths:
         # Edges in both directions, sorted by start:
         self._starts, self._targets = np.zeros(n + 1, np.int32), np.zeros(0, np.int32)
         self._edge_index, self._cost = np.zeros(0, np.int64), np.zeros(0)
-        self._gone_count = 0  # removed edges that are still in the arrays, at an infinite cost
-        self._last_reach = _FURTHEST
+        self._removed_count = 0  # removed edges that are still in the arrays, at an infinite cost
+        self._last_reach = _MAX_COST
         self.add(n, a, b, cost, np.arange(len(a)) if index is None else index)
 
     def add(self, n: int, a: I64, b: I64, cost: F64, index: I64) -> None:
@@ -49,10 +49,10 @@ class ShortestPaths:
             row = slice(self._starts[u], self._starts[u + 1])
             self._cost[row][self._edge_index[row] == edge] = np.inf
         self._graph.data = self._cost
-        self._gone_count += 2 * len(index)
-        if self._gone_count > _MOST_GONE * len(self._cost):
+        self._removed_count += 2 * len(index)
+        if self._removed_count > _MAX_REMOVED_SHARE * len(self._cost):
             self._keep(np.isfinite(self._cost))
-            self._gone_count = 0
+            self._removed_count = 0
 
     def _keep(self, is_left: NDArray[np.bool_]) -> None:
         before = np.concatenate([[0], np.cumsum(is_left)])
@@ -71,7 +71,7 @@ class ShortestPaths:
         """
         from scipy.sparse.csgraph import dijkstra
 
-        found = dijkstra(self._graph, indices=start, return_predecessors=True, limit=_FURTHEST)
+        found = dijkstra(self._graph, indices=start, return_predecessors=True, limit=_MAX_COST)
         return np.asarray(found[1], np.int64)
 
     def predecessors_of(self, start: int, goals: I64) -> I64:
@@ -85,11 +85,12 @@ class ShortestPaths:
         while True:
             cost, before = dijkstra(self._graph, indices=start, return_predecessors=True, limit=reach)
             furthest = cost[goals].max(initial=0.0)
-            if np.isfinite(furthest) or reach == _FURTHEST:
+            if np.isfinite(furthest) or reach == _MAX_COST:
                 break
             count, before_count = np.isfinite(cost).sum(), count
-            is_vain = count == before_count or count > len(cost) / _WIDER  # a goal may be unreachable
-            reach = _FURTHEST if is_vain else min(_WIDER * reach, _FURTHEST)
+            # a goal may be unreachable
+            searches_all = count == before_count or count > len(cost) / _REACH_FACTOR
+            reach = _MAX_COST if searches_all else min(_REACH_FACTOR * reach, _MAX_COST)
         if np.isfinite(furthest) and furthest > 0:
             self._last_reach = 2 * float(furthest)
         return np.asarray(before, np.int64)

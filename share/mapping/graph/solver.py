@@ -14,7 +14,7 @@ import numpy as np
 from share.checks import checked_array
 from share.mapping.graph.covariance import relative_covariances
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
-from share.mapping.graph.gravity import turned_back, turned_upright
+from share.mapping.graph.gravity import restore_tilt, turned_upright
 from share.mapping.graph.optimiser import chain_order, optimise
 from share.types import F64, I64
 
@@ -153,7 +153,7 @@ class PoseGraphSolver:
         gravity_factors, before = self._gravity_factors[component][order], self._poses[component][order]
         upright = turned_upright(before, gravity_factors, anchor_index)
         minimum = optimise(upright, gravity_factors, ordered_edges, anchor_index, self._cauchy_width)
-        poses = (before if minimum.reason else turned_back(minimum.poses, before, anchor_index))[rank]
+        poses = (before if minimum.reason else restore_tilt(minimum.poses, before, anchor_index))[rank]
         if minimum.reason:
             goals = goals[:0]
         else:

@@ -44,7 +44,7 @@ class IndexEntry(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
+class _ResidentKeyframe:
     """What always stays in memory of a keyframe.
 
     view: as the agent sent it; mostly empty. surfaces: its image without the JPEG.
@@ -69,7 +69,7 @@ class KeyframeViews:
     def __init__(self, archive: ArchiveReader | None = None) -> None:
         self.index = PlaceIndex()
         self._archive = archive
-        self._known: dict[int, _Known] = {}
+        self._known: dict[int, _ResidentKeyframe] = {}
         self.by_node: Mapping[int, CameraView] = _OnDemand(self._known, self._camera_view)
         self._images: dict[int, None] = {}  # keyframes with an image
         self._jpegs: OrderedDict[int, U8] = OrderedDict()  # the last used is last, also below
@@ -96,7 +96,7 @@ class KeyframeViews:
 
     def _add(self, node_id: int, key: KeyframeKey, keyframe: Keyframe, rig: Rig, has_image: bool) -> None:
         image, view = keyframe.image, keyframe.view if len(keyframe.view) else _NO_VIEW
-        self._known[node_id] = _Known(key, rig, keyframe.up, view, image.without_jpeg(), has_image)
+        self._known[node_id] = _ResidentKeyframe(key, rig, keyframe.up, view, image.without_jpeg(), has_image)
         if has_image:
             self._images[node_id] = None
             if not len(keyframe.view):

@@ -32,7 +32,7 @@ _BORDER_PX = 6.0  # a patch's centre is at least so far inside the other image
 _REACH_PX = 5.0  # largest distance from the predicted position, px of the level
 _MIN_CORRELATION = 0.8
 _CONVERGED_PX = 0.3  # last step of a converged alignment
-_MAX_STRETCH = 3.0  # of a warped patch, or the inverse
+_MAX_MAGNIFICATION = 3.0  # of a warped patch, or the inverse
 _MAX_STEPS = 8
 _SIGMA_PX = 0.2  # of an aligned position
 _INLIER_CHI2 = 9.2  # 99 %, 2 degrees of freedom
@@ -159,11 +159,11 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
     return replace(verified, cov=_UNALIGNED_VARIANCE * verified.cov, depth_scale=scale, is_confirmed=False)
 
 
-def align_unsure(refused: Refusal, query: ImageView, candidate: ImageView) -> Verification | Refusal:
+def align_undetermined(refused: Refusal, query: ImageView, candidate: ImageView) -> Verification | Refusal:
     """Return the pose of a pair whose features do not determine one, by aligning the images from each pose
     that they allow; the refusal where that fails, gives two poses, or one that is uncertain too."""
     found: list[Verification] = []
-    for T_c_q in refused.unsure_poses:
+    for T_c_q in refused.possible_poses:
         aligned = _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
         if isinstance(aligned, Verification):
             found.append(aligned)
@@ -267,9 +267,11 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
     by_ray = T[:3, :3] + T[:3, 3, None] * source.plane[:, None, :]  # d q / d ray, along the plane
     warp = target.camera.jacobian(uv) @ D @ by_ray[:, :, :2] @ source.uv_per_px
     px = target.camera.distort(uv)
-    stretch = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(warp))))
+    magnification = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(warp))))
     inside = target.camera.is_inside(np.nan_to_num(px, nan=-1e6), _BORDER_PX)
-    index = np.flatnonzero(inside & (stretch < _MAX_STRETCH) & (stretch > 1 / _MAX_STRETCH))
+    index = np.flatnonzero(
+        inside & (magnification < _MAX_MAGNIFICATION) & (magnification > 1 / _MAX_MAGNIFICATION)
+    )
     if len(index) == 0:
         return _Alignment(index, np.zeros((0, 2)), 0)
     size = 2.0**level

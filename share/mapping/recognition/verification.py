@@ -98,10 +98,10 @@ class Verification:
 class Refusal:
     """Why there is no pose, e.g. "17 inliers of 25 needed".
 
-    unsure_poses: T_c_q (4, 4) as in `Verification` that enough features fit, but do not determine."""
+    possible_poses: T_c_q (4, 4) as in `Verification` that enough features fit, but do not determine."""
 
     reason: str
-    unsure_poses: tuple[F64, ...] = field(default=(), compare=False)
+    possible_poses: tuple[F64, ...] = field(default=(), compare=False)
 
 
 class _RefusedError(Exception):

@@ -171,5 +171,5 @@ def test_each_step_of_a_look_up_has_its_delay(step: LookupStep, accepted: str, r
         loop = Verification(np.eye(4), np.eye(6), 80, 70)
         done = getattr(delays, accepted)
         checked = Delay(done.p50 + delays.check_loop.p50, done.p95 + delays.check_loop.p95)
-        assert room._delay_of(step, loop) == checked
-    assert room._delay_of(step, Refusal("no")) == getattr(delays, refused)
+        assert room.delay_of(step, loop) == checked
+    assert room.delay_of(step, Refusal("no")) == getattr(delays, refused)

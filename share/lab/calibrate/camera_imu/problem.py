@@ -19,7 +19,7 @@ from share.lab.calibrate.corners import MIN_SIGMA_PX, robust_sigma
 from share.lab.least_squares import ArrowFactor, ArrowSystem, minimise
 from share.types import F64, I64, ImuBatch
 
-_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: larger than any IMU's
+BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: larger than any IMU's; holds unobservable biases only
 _MIN_WALK = 1e-7
 _MAX_STEPS = 30
 _CONVERGED = 1e-7  # relative decrease of the cost
@@ -76,7 +76,7 @@ class CameraImuProblem:
         g = system.g_border[SHARED:].reshape(-1, 6)  # a view
         steps = np.diff(state.biases, axis=0)
         diagonal = np.zeros_like(state.biases)
-        diagonal[0] += _BIAS_SIGMA**-2
+        diagonal[0] += BIAS_SIGMA**-2
         diagonal[1:] += weight
         diagonal[:-1] += weight
         columns = np.arange(SHARED, SHARED + state.biases.size)
@@ -86,8 +86,8 @@ class CameraImuProblem:
         system.corner[columns[6:], columns[:-6]] -= cross
         g[1:] -= weight * steps
         g[:-1] += weight * steps
-        g[0] -= state.biases[0] / _BIAS_SIGMA**2
-        return float(((state.biases[0] / _BIAS_SIGMA) ** 2).sum() + (weight * steps**2).sum()) / 2
+        g[0] -= state.biases[0] / BIAS_SIGMA**2
+        return float(((state.biases[0] / BIAS_SIGMA) ** 2).sum() + (weight * steps**2).sum()) / 2
 
     def residual_sigmas(self, state: CameraImuState, stated: Sigmas) -> Sigmas:
         """Return sigmas estimated from residuals; of the IMU at least the stated ones."""

@@ -10,10 +10,10 @@ from share.geometry import se3
 from share.lab.calibrate import corners
 from share.lab.calibrate.camera_imu.fit import CameraImuFit
 from share.lab.calibrate.camera_imu.problem import conservative_rms
+from share.lab.calibrate.imu import STANDARD_GRAVITY
 from share.lab.calibrate.report import corner_failures
 from share.types import F64
 
-_STANDARD_GRAVITY = 9.80665
 _NEAR_DEG = 1.0  # one unit of distance between two mountings
 _NEAR_MM = 5.0  # likewise
 _FAR_UNITS = 4.0  # more is reported
@@ -106,10 +106,10 @@ def _imu_failures(gyro: float, accel: float, gravity: F64) -> list[str]:
         for name, times in (("gyroscope", gyro), ("accelerometer", accel))
         if not times <= MAX_NOISE_RATIO
     ]
-    deviation = float(np.linalg.norm(gravity)) - _STANDARD_GRAVITY
+    deviation = float(np.linalg.norm(gravity)) - STANDARD_GRAVITY
     if not abs(deviation) <= MAX_GRAVITY_ERROR:
         out.append(
-            f"gravity differs by {deviation:+.2f} m/s^2 from {_STANDARD_GRAVITY:g}, at most "
+            f"gravity differs by {deviation:+.2f} m/s^2 from {STANDARD_GRAVITY:g}, at most "
             f"{MAX_GRAVITY_ERROR:g} allowed: check the accelerometer's scale and units"
         )
     return out

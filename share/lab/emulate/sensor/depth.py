@@ -16,10 +16,10 @@ import numpy as np
 
 from share.errors import ConfigError
 from share.lab.emulate.sensor.clock import Seed
+from share.lab.emulate.sensor.imager import BANK_MARGIN
 from share.sensors.profile_types import CameraModel, Profile
 from share.types import F32, U8
 
-_BANK_MARGIN = 512  # the noise bank exceeds a picture by this
 _EDGE_DISPARITY_PX = 1.5  # disparity step that counts as an edge; slopes have less
 _ROUNDING = 1 / 12  # variance of rounding gray levels
 
@@ -93,7 +93,7 @@ class DepthSensor:
         return hidden
 
     def _read_bank(self, shape: tuple[int, ...], frame: int) -> list[F32]:
-        places = np.random.default_rng((*self._seed, 1, frame)).integers(0, _BANK_MARGIN, (2, 2))
+        places = np.random.default_rng((*self._seed, 1, frame)).integers(0, BANK_MARGIN, (2, 2))
         return [self._bank[top : top + shape[0], left : left + shape[1]] for top, left in places]
 
 
@@ -109,7 +109,7 @@ def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
 
 def _noise_bank(shape: tuple[int, int], smooth_px: float, seed: Seed) -> F32:
     """Return standard normal numbers correlated over `smooth_px` pixels, more than a picture needs."""
-    white = np.random.default_rng((*seed, 0)).standard_normal([n + _BANK_MARGIN for n in shape], np.float32)
+    white = np.random.default_rng((*seed, 0)).standard_normal([n + BANK_MARGIN for n in shape], np.float32)
     smooth = cv2.GaussianBlur(white, (0, 0), smooth_px) if smooth_px else white
     out: F32 = (smooth / smooth.std()).astype(np.float32)
     return out

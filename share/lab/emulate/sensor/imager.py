@@ -114,7 +114,7 @@ def blur_offsets(exposure_ms: float, pixels_of_motion: float) -> F64:
 
 # The imager.
 
-_BANK_MARGIN = 512  # the noise bank exceeds a picture by this, so there are 512^2 offsets to read it at
+BANK_MARGIN = 512  # the noise bank exceeds a picture by this, so there are 512^2 offsets to read it at
 
 
 class Imager:
@@ -134,7 +134,7 @@ class Imager:
         if noise:
             self._response *= 1 + model.pixel_gain * rng.standard_normal(shape, np.float32)
             self._offset_e = model.pixel_offset_e * rng.standard_normal(shape, np.float32)
-            self._bank = rng.standard_normal([n + _BANK_MARGIN for n in shape], np.float32)
+            self._bank = rng.standard_normal([n + BANK_MARGIN for n in shape], np.float32)
 
     @property
     def mean_response(self) -> float:
@@ -158,7 +158,7 @@ class Imager:
 
     def _noise_image(self, gray: F32, frame: int, gain: float) -> F32:
         K = 255 * gain / self._model.full_well_e
-        top, left = np.random.default_rng((*self._seed, 1, frame)).integers(0, _BANK_MARGIN, 2)
+        top, left = np.random.default_rng((*self._seed, 1, frame)).integers(0, BANK_MARGIN, 2)
         white = self._bank[top : top + gray.shape[0], left : left + gray.shape[1]]
         sigma = cv2.sqrt(cv2.add(gray * K, (K * self._model.read_e) ** 2))
         out: F32 = cv2.add(cv2.multiply(white, sigma), self._offset_e * K)

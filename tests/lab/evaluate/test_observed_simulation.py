@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from share.config import Config
-from share.lab.evaluate.shown_simulation import shown_simulation
+from share.lab.evaluate.observed_simulation import observed_simulation
 from share.protocol.edge_events import AddKeyframe, AddRun, EdgeEffect, MapperResult
 from share.protocol.peer import RestoredRun
 from share.recordings.session import read_session
@@ -44,7 +44,7 @@ class Seen(EdgeObserver):
 @pytest.mark.long
 def test_all_that_an_edge_shows_is_shown(plain_session: Path) -> None:
     session, seen, times = read_session(plain_session), Seen(), list[float]()
-    shown_simulation(session, Config(), seen).play(2.0, times.append)
+    observed_simulation(session, Config(), seen).play(2.0, times.append)
     assert seen.begun == 1 and times == pytest.approx([0.05 * k for k in range(1, 41)])
     assert len(seen.poses) == 40 and len(seen.reports) == 4
     assert {one.hello.name for one in seen.effects if isinstance(one, AddRun)} == set(session.agents)

@@ -16,7 +16,7 @@ from share.runtime.edge_observer import EdgeObserver
 _POSES_S, _REPORT_EVERY = 0.05, 10  # as a real edge shows them: poses, and poses between reports
 
 
-class ShownSimulation(Simulation):
+class ObservedSimulation(Simulation):
     """Tells an observer, if there is one."""
 
     observer: EdgeObserver | None = None
@@ -26,7 +26,7 @@ class ShownSimulation(Simulation):
         if self.observer is not None and isinstance(event, ed.MapperResult):
             self.observer.add_result(event)
 
-    def _edge_did(self, effect: ed.EdgeEffect) -> None:
+    def _on_edge_effect(self, effect: ed.EdgeEffect) -> None:
         if self.observer is not None:
             self.observer.add_effect(effect)
 
@@ -44,7 +44,9 @@ class ShownSimulation(Simulation):
             after_poses(k * _POSES_S)
 
 
-def shown_simulation(session: Session, settings: Config, observer: EdgeObserver | None) -> ShownSimulation:
+def observed_simulation(
+    session: Session, settings: Config, observer: EdgeObserver | None
+) -> ObservedSimulation:
     """Return a room with the agents of a session, which are tracked first."""
     tracked = track_session(
         session.folder.resolve(),
@@ -54,7 +56,7 @@ def shown_simulation(session: Session, settings: Config, observer: EdgeObserver 
         settings.agent.error_model,
     )
     members = session_members(session, tracked, LinkAssignment.parse(None))
-    room = ShownSimulation(settings, members, ProcessingDelays(), seed=0)
+    room = ObservedSimulation(settings, members, ProcessingDelays(), seed=0)
     room.observer = observer
     if observer is not None:
         observer.begin_session(None, [])
