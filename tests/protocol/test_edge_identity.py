@@ -10,6 +10,7 @@ import pytest
 from helpers.hellos import hello_of
 
 from share.agent_names import checked_name
+from share.checks import MAX_ID
 from share.config import Config
 from share.mapping.map_changes import SaveCredential
 from share.protocol import edge_events as ed
@@ -94,15 +95,24 @@ def test_no_output_reveals_the_run_id() -> None:
         assert digits not in text
 
 
-def test_a_jump_of_ids_costs_one_message() -> None:
+@pytest.mark.parametrize("number", [5 * 10**7, 10**9, MAX_ID])
+def test_a_jump_of_ids_costs_one_message(number: int) -> None:
     edge = Edge(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     tell(edge, keyframe(0), None)
-    effects = tell(edge, replace(keyframe(1), id=10**9, reference=-1, predecessor=-1), None)
+    effects = tell(edge, replace(keyframe(1), id=number, reference=-1, predecessor=-1), None)
     assert not of(effects, ed.AddKeyframe)
     assert sent(effects) == [m.Ack(1)]
     assert of(tell(edge, keyframe(1), None), ed.AddKeyframe)
     assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
+
+
+@pytest.mark.parametrize("name", ["n" * 57, "n" * 58, "n" * 64, "é" * 64, "日" * 64])
+def test_the_map_of_an_agent_with_a_long_name_can_be_sent(name: str) -> None:
+    (join,) = of(tell(Edge(Config(), 7), hello_of(name, SECRET), None), ed.AddRun)
+    map_id = f"{join.key}/999999"  # of its segment of that number
+    sent_back = decode(encode(m.Correction(np.eye(4), np.eye(6), map_id, 1, 0, 0)))
+    assert isinstance(sent_back, m.Correction) and sent_back.map_id == map_id
 
 
 def test_the_credential_of_a_run_follows_the_authorised_key() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from helpers.map_changes import ANN, BOB, small_map
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
 from share.mapping.corrections import MapEvent
+from share.net.transport import IncomingMessage
 from share.protocol.edge import Edge
-from share.protocol.edge_events import ChangesSaved, MapperResult, TrackerLost
+from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime.edge import EdgeRun
 from share.runtime.map_writer import MapWriter
@@ -225,6 +227,37 @@ def test_a_read_only_map_is_a_loss():
     assert restarts.losses == ["map m: read-only; nothing new is stored"]
     restarts.load_map()
     assert restarts.losses == ["the map file is no longer used: ValueError: x; nothing is saved"]
+
+
+class BusyLink(Link):
+    """200 messages that have arrived at once."""
+
+    def __init__(self):
+        self.waiting = deque(IncomingMessage(bytes([k]), [b"nonsense"]) for k in range(200))
+
+    def receive(self, timeout_ms):
+        return self.waiting.popleft() if self.waiting else super().receive(timeout_ms)
+
+
+def test_every_message_of_a_burst_is_handled(monkeypatch):
+    """The edge dropped each that came after 64 others."""
+    handled, handle = [], Edge.handle
+
+    def noting(self, event, now):
+        if isinstance(event, PeerMessageReceived):
+            handled.append(event.peer_id[0])
+        return handle(self, event, now)
+
+    monkeypatch.setattr(Edge, "handle", noting)
+    run = EdgeRun(Config(), BusyLink(), None, lambda fields: None)
+    thread = threading.Thread(target=run.run)
+    thread.start()
+    try:
+        until(lambda: len(handled) >= 200)
+        assert handled == list(range(200))
+    finally:
+        run.stop()
+        thread.join(30)
 
 
 def test_a_damaged_read_only_map_is_no_longer_used():
