@@ -43,7 +43,8 @@ class KeyframeLedger:
     fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896).
 
     A full ledger drops the oldest acknowledged one (policy drop_oldest_acknowledged); without one, the oldest
-    pending one (drop_oldest), and rebases the next keyframe onto the dropped one's reference. `counts` has both, by name.
+    pending one (drop_oldest), and rebases the next keyframe onto the dropped one's reference.
+    `counts` has both, by name.
     """
 
     def __init__(self, capacity: int, window: int) -> None:

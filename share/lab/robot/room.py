@@ -33,7 +33,6 @@ class EmulatedRoom:
     layout: Layout
     grid: RoomGrid
     people: tuple[Actor, ...]
-    robots: tuple[Actor, ...]
     folder: Path
 
     def open_renderer(self) -> RoomRenderer:
@@ -59,7 +58,6 @@ def open_room(session: Session, progress: Progress) -> EmulatedRoom:
         prepared.layout,
         RoomGrid(floor_from_occupancy(Occupancy.from_layout(prepared.layout))),
         tuple(actor for actor in actors if actor.kind is AgentKind.AR),
-        tuple(actor for actor in actors if actor.kind is AgentKind.ROBOT),
         prepared.stage.room,
     )
 
