@@ -62,8 +62,15 @@ class Edge:
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self.room = RoomDesk(self._out, self._registry, session, config.edge.silent_s, objects)
         self.room.restore(run.last_finding for run in restored if run.last_finding is not None)
-        parts = self._registry, self._out, self._rate_scheduler, trackers or RunTrackers(), self.room
-        self._membership = RoomMembership(config, session, *parts)
+        self._membership = RoomMembership(
+            config,
+            session,
+            self._registry,
+            self._out,
+            self._rate_scheduler,
+            self.room,
+            trackers or RunTrackers(),
+        )
         self._quota = KeyframeQuota(self._rate_scheduler.max_rate_hz)
         self._version_throttle, self._internal_errors = Throttle(_VERSION_REFUSAL_HZ, 1.0), 0
 
@@ -119,7 +126,7 @@ class Edge:
             self._on_other_version(event.peer_id, error)
             return
         except WireError as error:
-            self._out.count_bad_message(client or peer, str(error))
+            self._out.count_bad_message(client or peer, str(error), throttled=client is not None)
             return
         if peer is not None and not self._membership.may_send(event, peer, message):
             return

@@ -59,12 +59,12 @@ class RoomMembership:
         registry: RunRegistry,
         out: EdgeOutput,
         rate_scheduler: RateScheduler,
-        trackers: RunTrackers,
         room: RoomDesk,
+        trackers: RunTrackers,
     ) -> None:
         self._session, self._registry, self._out = session, registry, out
         self._silent_s = config.edge.silent_s
-        self._rate_scheduler, self._trackers, self._room = rate_scheduler, trackers, room
+        self._rate_scheduler, self._room, self._trackers = rate_scheduler, room, trackers
         self._admission = Admission(config.edge, trackers.tracks_agents, rate_scheduler.objection)
 
     def on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> None:
@@ -180,8 +180,8 @@ class RoomMembership:
         if self._registry.forget(peer):  # it was the latest of its name
             self._rate_scheduler.forget(peer.name)
         self._out.add(ed.DropRun(peer.key))
-        self._trackers.remove(peer.key)
         self._room.forget_run(peer.key)
+        self._trackers.remove(peer.key)
 
     def may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
         """Return whether a known run may send: its credential allows it, and it is present or comes back."""

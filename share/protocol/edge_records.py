@@ -13,7 +13,6 @@ from share.mapping.map_changes import MapChange
 from share.protocol.admission import RunRegistry
 from share.protocol.edge_events import EdgeEffect, SaveChanges, SendToPeer, WriteEvent
 from share.protocol.peer import Peer
-from share.protocol.room_clients import Client
 from share.timing import Throttle
 from share.wire.codec import WIRE_VERSION, encode, message_bytes
 from share.wire.messages import DownlinkMessage
@@ -106,6 +105,12 @@ class Named(Protocol):
     def name(self) -> str: ...
 
 
+class CountedSender(Named, Protocol):
+    """Whose messages are counted."""
+
+    def count(self, kind: str, reason: str, now_ns: int) -> int: ...
+
+
 class EdgeOutput:
     """Collects the effects of one event: messages, records, changes to be stored. now_ns: its time."""
 
@@ -144,10 +149,11 @@ class EdgeOutput:
         answered = {"revision": peer.revision, "answers": correction.answered_keyframe}
         self.record(finding.event, peer, finding.reason, is_repeat, map_id=correction.map_id, **answered)
 
-    def count_bad_message(self, peer: Peer | Client | None, reason: str) -> None:
-        """Count a bad message; record the first of each peer."""
-        if (peer or self._registry.unjoined).count("bad_messages", reason, self.now_ns) == 1:
-            self.record("bad message", peer, reason, throttled=isinstance(peer, Client))
+    def count_bad_message(self, sender: CountedSender | None, reason: str, throttled: bool = False) -> None:
+        """Count a bad message; record the first of each sender. throttled: as in `record`, for senders that a
+        peer can make many of."""
+        if (sender or self._registry.unjoined).count("bad_messages", reason, self.now_ns) == 1:
+            self.record("bad message", sender, reason, throttled)
 
     def record(
         self, event: EventKind, peer: Named | None, reason: str, throttled: bool = True, **fields: Any

@@ -253,9 +253,9 @@ function show(now) {
     ({cells: [name, place(robot.pose), robot.map_id, robot.text]})));
   table("objects", ["object", "kind", "owner", "x, y (m)", "map"], entries(now.objects).map(([id, it]) =>
     ({cells: [id, it.kind, it.owner, place(it.position), it.map_id]})));
-  const clients = now.clients ?? [];
-  table("clients", ["client", "drives a robot", "refused messages", "the last"], clients.map(one =>
-    ({cells: [one.name, one.drives_robot ? "yes" : "", one.refused_messages, one.last_refusal]})));
+  table("clients", ["client", "drives a robot", "refused messages", "the last"],
+    entries(now.clients).map(([, one]) => ({cells: [
+      one.name, one.drives_robot ? "yes" : "", one.refused_messages, one.last_refusal]})));
   const loops = now.loops ?? {};
   table("loops", ["tried", "accepted", "waiting for a supporting loop", "in the maps", "merges"],
     now.loops ? [{cells: [loops.tried, loops.accepted, loops.waiting, loops.in_map, now.merges?.done]}] : []);
