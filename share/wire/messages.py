@@ -162,7 +162,7 @@ class Bye:
 @dataclass(frozen=True)
 class Welcome:
     """The edge accepts the run. session: this start of the edge; the agent continues at keyframe
-    `next_keyframe`, after hold_ms (`share.scheduling.room_controller`)."""
+    `next_keyframe`, after hold_ms (`share.scheduling.staggered_start`)."""
 
     session: int
     next_keyframe: int

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.scheduling.room_controller import MAX_HOLD_S, UNKNOWN_KEYFRAME_S, StaggeredStart
+from share.scheduling.staggered_start import MAX_HOLD_S, UNKNOWN_KEYFRAME_S, StaggeredStart
 from share.wire.messages import MAX_HOLD_MS
 
 S = 1_000_000_000
