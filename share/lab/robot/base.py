@@ -16,7 +16,10 @@ from share.types import F64
 
 _BUMPER_M = RADIUS - 0.03  # a Create 3 is 34 cm wide
 _AHEAD_M = 0.03
-_PERSON_M, _PERSON_RAD = 0.65, 1.2  # nearer and ahead: it waits (Nav2's collision monitor)
+_PERSON_M, _PERSON_RAD = (
+    0.55,
+    1.2,
+)  # nearer and ahead: it waits (Nav2's collision monitor); less than plans keep off
 
 
 class RobotBase:

@@ -17,7 +17,7 @@ from share.robot.planar import PlanarPose
 from share.types import F64
 
 _NEAREST_M = 0.5  # a start or goal in an obstacle is moved so far at most (NavFn's tolerance)
-_PERSON_M = 0.3  # radius of a person seen by a lidar
+_PERSON_M = 0.4  # radius of a person, with a margin
 
 
 class RoomGrid:
