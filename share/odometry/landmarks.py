@@ -355,4 +355,4 @@ def _near_few(rho: F64) -> NDArray[np.bool_]:
     They say the most about translation: one who stands before the camera and sways outweighs a room.
     """
     near: NDArray[np.bool_] = rho > _NEAR_RATIO * np.median(rho)
-    return near & np.bool_(near.mean() < _MAX_NEAR_SHARE)
+    return near if near.mean() < _MAX_NEAR_SHARE else np.zeros(len(rho), bool)
