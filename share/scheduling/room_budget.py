@@ -34,7 +34,9 @@ SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them in
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 # air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a keyframe's
 _MESSAGE_S, _MESSAGE_PART = 3e-4, 0.006
-OTHER_HZ = 8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
+OTHER_HZ = (
+    8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
+)
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _LOAD_STEP = 0.01
 MAX_LOAD = 0.95  # beyond, the formula has no meaning

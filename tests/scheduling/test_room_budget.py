@@ -94,7 +94,7 @@ def test_time_on_the_air_follows_from_what_is_measured_at_any_load() -> None:
 
 
 def test_slow_air_that_few_share_is_not_short() -> None:
-    """At 15 Mbit/s a keyframe takes 18 ms, however few there are; at 5 Mbit/s one agent still has what it wants."""
+    """At 15 Mbit/s a keyframe takes 18 ms, however few there are; at 5 one agent still has what it wants."""
     assert not room(*[agent(keyframe_ms=18.5)] * 2).is_short()
     assert room(*[agent(keyframe_ms=40.0)] * 12).is_short()
     assert room(agent(keyframe_ms=54.0)).allocate()["a0"].hz == 1.5
