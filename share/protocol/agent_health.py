@@ -1,9 +1,9 @@
 """What is wrong with an agent as its edge sees it: late poses, late corrections, a large error, a clock that
 is not synchronised, keyframes that are not acknowledged.
 
-A low QoE is no trouble: it is what scheduling steers, and falls with each millisecond until a correction. What
-the wearer sees is late by the age of its poses, and off by the error; a correction that takes 100 ms shows only
-by what the agent has drifted meanwhile, which its error counts.
+A low QoE is no trouble: it is what scheduling steers, and falls with each millisecond until a correction.
+What the wearer sees is late by the age of its poses, and off by the error; a correction that takes 100 ms
+shows only by what the agent has drifted meanwhile, which its error counts.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class PoseAges:
 
 @dataclass(frozen=True)
 class KindLimits:
-    """What a kind of agent tolerates. pose_ms: usual age of its poses. delay_ms, error_cm: as in `Evaluation`."""
+    """What a kind of agent tolerates. pose_ms: usual age of its poses. Others: as in `Evaluation`."""
 
     pose_ms: float
     delay_ms: float

@@ -40,7 +40,9 @@ class KeyframeLedger:
 
     Only the first `window` pending ones are in flight. One is sent again once the edge has answered something
     that was sent after it: a link keeps the order, so until then it is on its way, and to send it twice would
-    fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896). A full ledger drops the oldest acknowledged one
+    fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896).
+
+    A full ledger drops the oldest acknowledged one
     (policy drop_oldest_acknowledged); without one, the oldest pending one (drop_oldest), and rebases the next
     keyframe onto the dropped one's reference. `counts` has both, by name.
     """

@@ -6,10 +6,10 @@ measured, A, the time that keyframes take, and what arrives a second: L keyframe
 c + k T each. The load is L T + M (c + k T), so T = A (1 - M c) / (1 + A (L + k M)). It does not depend on the
 load, so rates that follow from it do not swing.
 
-Where keyframes at the rates that all want would wait for each other for more than `FREE_WAIT_MS`, every agent
-begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as long as
-they wait for less; then only where a step gains a headset more QoE than the delay that it causes costs all. What
-a keyframe takes alone on slow air, no rate changes, so it does not count.
+Where keyframes at the rates that all want would wait for each other for more than `FREE_WAIT_MS`, every
+agent begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as
+long as they wait for less; then only where a step gains a headset more QoE than the delay that it causes
+costs all. What a keyframe takes alone on slow air, no rate changes, so it does not count.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ class RoomBudget:
     def allocate(
         self, wait_ms: float = FREE_WAIT_MS, before: Mapping[str, RateGrant] | None = None
     ) -> dict[str, RateGrant]:
-        """Return what every agent may send where the air is short. before: what they have, which changes hands
-        only for a much larger gain."""
+        """Return what every agent may send where the air is short. before: what they have, which changes
+        hands only for a much larger gain."""
         held_hz = np.array([before[n].hz if before and n in before else 0.0 for n in self.agents])
         rates = _Prediction(self, is_thinned=True).allocate(wait_ms, held_hz)
         return {name: scarce_grant(self.agents[name].terms.form, hz) for name, hz in rates.items()}
@@ -207,8 +207,8 @@ class _Prediction:
         return bool(self._waits(self._load(self._wanted_hz), wait_ms))
 
     def allocate(self, wait_ms: float, held_hz: F64) -> dict[str, float]:
-        """Return the rates, Hz: least ones, then steps to whom they gain most; while waits are short, those of
-        who comes first before those of others."""
+        """Return the rates, Hz: least ones, then steps to whom they gain most; while waits are short,
+        those of who comes first before those of others."""
         hz = self._least_hz.copy()
         while len(hz) and (load := self._load(hz)) < MAX_LOAD:
             is_open = hz + _STEP_HZ <= self._wanted_hz

@@ -217,7 +217,7 @@ def test_the_resend_interval_doubles() -> None:
 
 
 def test_what_is_still_on_its_way_is_not_sent_again() -> None:
-    """A link keeps the order: while what was sent later is not answered either, a keyframe waits in a queue."""
+    """A link keeps the order: while what was sent later is not answered either, it waits in a queue."""
     book = ledger(2)
     assert due(book, S) == [0, 1]
     book.record_answer(S)  # a ping, right before them
