@@ -68,7 +68,7 @@ class AgentConfig:
     """The agent: keyframes, corrections, error model."""
 
     keep_keyframes: int = 600  # keyframes kept, sent ones included, to resend to a restarted edge
-    late_ms: float | None = None  # later frames get a pose from the IMU; 0: none; null: 100 for a headset
+    late_ms: float | None = None  # later frames get a pose from the IMU; 0: none; null: 100, a robot 400
     blend_s: float = 0.5  # time constant with which the pose follows a correction
     finish_s: float = 5.0  # longest wait for acknowledgements at the end of a run
     error_model: str = "shipped"  # error model: shipped, a file, or "" for odometry's covariance

@@ -90,7 +90,7 @@ def simulate(
     Example:  share emulate --scene warehouse --motion ann=walk: --seconds 120 --out room1
               share robot simulate room1 --goals 5 --out drive
     """
-    from share.files.writing import new_folder
+    from share.files.writing import atomic_write, new_folder
     from share.lab.robot.report import draw_run, outcome_rows, run_report, summary_text
     from share.lab.robot.room import open_room
     from share.lab.robot.simulate import simulate as run_simulation
@@ -108,7 +108,7 @@ def simulate(
 
         run = run_simulation(opened, room, loop_options, config, robot, show)
         report = run_report(run, str(session))
-        (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+        atomic_write(folder / "report.json", json.dumps(report, indent=1) + "\n")
         draw_run(folder / "plan.png", room, run)
     if as_json:
         click.echo(json.dumps(report))

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
-from http.client import HTTPException
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from functools import partial
+from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException
+from socket import SHUT_RDWR, socket
+from threading import Timer
 from typing import Any
-from urllib.error import HTTPError, URLError
-from urllib.request import ProxyHandler, Request, build_opener
+from urllib.parse import urlsplit
 
 from share.cli.terminal import LiveLine
 from share.errors import ShareError, printable
+from share.files.json_file import parse_json
 from share.view.terminal_picture import MIN_COLUMNS, MIN_ROWS, TerminalPicture
 
 _TIMEOUT_S = 0.4
@@ -19,44 +24,65 @@ _MAX_ANSWER = 2**22
 
 
 class EdgeStatus:
-    """Reads the status page at `address`, http://HOST:PORT/. token: as in `share edge --http-token`."""
+    """Reads the status page at `address`, http://HOST:PORT/.
+
+    token: as in `share edge --http-token`; it goes to that address alone, so no redirection is followed, and
+    no proxy asked. timeout_s: of a whole answer.
+    """
 
     def __init__(self, address: str, token: str | None = None, timeout_s: float = _TIMEOUT_S) -> None:
         self._address, self._timeout_s = address, timeout_s
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._opener = build_opener(ProxyHandler({}))
 
     def report_and_plan(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return what the edge reports and its plan of paths. Raises ShareError if it does not answer."""
         try:
-            report, plan = self._get("snapshot.json"), self._get("plan.json")
-        except HTTPError as error:
-            with error:  # closes the connection
-                raise ShareError(f"{self._address}: {_refusal(error)}") from None
-        except URLError as error:
-            raise ShareError(f"{self._address} does not answer: {printable(str(error.reason))}") from None
+            return self._get("snapshot.json"), self._get("plan.json")
         except (OSError, HTTPException) as error:
-            raise ShareError(f"{self._address} does not answer: {printable(str(error))}") from None
+            reason = printable(str(error) or type(error).__name__)
+            raise ShareError(f"{self._address} does not answer: {reason}") from None
         except ValueError:  # no JSON, or more than is read
             raise ShareError(f"{self._address}: what answers there is no edge's status page") from None
-        if not all(
-            isinstance(part, dict) and isinstance(part.get("agents", {}), dict) for part in (report, plan)
-        ):
-            raise ShareError(f"{self._address}: what answers there is no edge's status page")
-        return report, plan
 
-    def _get(self, name: str) -> Any:
-        request = Request(self._address + name, headers=self._headers)
-        with self._opener.open(request, timeout=self._timeout_s) as answer:
-            return json.loads(answer.read(_MAX_ANSWER))
+    def _get(self, name: str) -> dict[str, Any]:
+        where = urlsplit(self._address)
+        with closing(HTTPConnection(where.hostname or "", where.port, timeout=self._timeout_s)) as connection:
+            connection.connect()
+            with _deadline(connection.sock, self._timeout_s):
+                connection.request("GET", f"/{name}", headers=self._headers)
+                with connection.getresponse() as answer:
+                    if answer.status != HTTPStatus.OK:
+                        raise ShareError(f"{self._address}: {_refusal(answer.status)}")
+                    content = answer.read(_MAX_ANSWER)
+        fields = parse_json(content)
+        if not isinstance(fields, dict) or not isinstance(fields.get("agents", {}), dict):
+            raise ValueError(name)
+        return fields
 
 
-def _refusal(error: HTTPError) -> str:
-    if error.code == 401:
+@contextmanager
+def _deadline(connection: socket, seconds: float) -> Iterator[None]:
+    """End a connection whose other side takes longer, however steadily it sends."""
+    timer = Timer(seconds, partial(_shut_down, connection))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _shut_down(connection: socket) -> None:
+    with suppress(OSError):  # it has ended
+        connection.shutdown(SHUT_RDWR)
+
+
+def _refusal(status: int) -> str:
+    if status == HTTPStatus.UNAUTHORIZED:
         return "it asks for a token: give the edge's file with --http-token FILE"
-    if error.code == 404:
-        return "what answers there is no edge's status page"
-    return printable(f"it answers {error.code} {error.reason}")
+    if status in (HTTPStatus.FORBIDDEN, HTTPStatus.INTERNAL_SERVER_ERROR):
+        return f"it answers {status}"
+    return "what answers there is no edge's status page"
 
 
 class TerminalRoom:
@@ -85,11 +111,22 @@ def draw_room(
     live.write_block([*lines, below[: shutil.get_terminal_size().columns - 1]])
 
 
-def room_lines(picture: TerminalPicture, report: dict[str, Any], plan: dict[str, Any]) -> list[str]:
-    """Return the room as lines that fit the terminal. Raises ShareError for a report of another release."""
+def room_lines(
+    picture: TerminalPicture, report: dict[str, Any], plan: dict[str, Any], rows: int | None = None
+) -> list[str]:
+    """Return the room as lines as wide as the terminal, and no more than `rows` (default: that fit it).
+
+    Raises ShareError for a report of another release."""
     size = shutil.get_terminal_size()
+    with reading_report():
+        return picture.lines(report, plan, size.columns - 1, rows or size.lines - 2)
+
+
+@contextmanager
+def reading_report() -> Iterator[None]:
+    """Turn what goes wrong with fields of a report into a ShareError."""
     try:
-        return picture.lines(report, plan, size.columns - 1, size.lines - 2)
+        yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         raise ShareError("the edge's report cannot be drawn: it is of another release of SHARE") from None
 

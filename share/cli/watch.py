@@ -14,10 +14,12 @@ from share.cli.terminal import LiveLine
 from share.errors import ShareError, UsageError
 
 _PERIOD_S, _TIMEOUT_S = 0.5, 2.0
+_MAX_ROWS = 200  # printed where no terminal is
+_PORT = 8080
 
 
 @click.command()
-@click.argument("address", default="127.0.0.1:8080", metavar="[[H:]P]")
+@click.argument("address", default=f"127.0.0.1:{_PORT}", metavar="[H:P]")
 @click.option(
     "--http-token",
     metavar="FILE",
@@ -31,13 +33,13 @@ def watch(address: str, http_token: Path | None, once: bool, as_json: bool) -> N
 
     Draws the paths of all agents seen from above, and of each agent its state, the age of its poses against
     what its kind tolerates, QoE and keyframe rate, and what is wrong. It reads the status page at H:P
-    (127.0.0.1:8080) of an edge that runs with --http, and changes nothing there. Without a terminal, or with
-    --once or --json, it prints once: text, or the edge's report.
+    (127.0.0.1:8080; either may be left out) of an edge that runs with --http, and changes nothing there.
+    Without a terminal, or with --once or --json, it prints once: text, or the edge's report.
 
     \b
     Example:  share watch 192.168.1.10:8080 --http-token room.token
     """
-    from share.cli.terminal_room import EdgeStatus, draw_room, has_room, room_lines
+    from share.cli.terminal_room import EdgeStatus, draw_room, has_room, reading_report, room_lines
     from share.net.http_guard import read_token
     from share.view.terminal_picture import TerminalPicture
 
@@ -50,12 +52,15 @@ def watch(address: str, http_token: Path | None, once: bool, as_json: bool) -> N
         click.echo(json.dumps(report))
         return
     if once or not has_room(live):
-        click.echo("\n".join(room_lines(picture, report, plan)))
+        lines = room_lines(picture, report, plan, _MAX_ROWS)
+        click.echo("\n".join(lines) if any(lines) else f"{url}: no agent has come yet")
         return
     answered_s = time.monotonic()
     try:
         while True:
-            draw_room(live, picture, report, plan, _last_line(url, report, time.monotonic() - answered_s))
+            with reading_report():
+                below = _last_line(url, report, time.monotonic() - answered_s)
+            draw_room(live, picture, report, plan, below)
             time.sleep(_PERIOD_S)
             try:
                 report, plan = status.report_and_plan()
@@ -71,13 +76,17 @@ def _status_url(address: str) -> str:
     from share.net.transport import parse_address
 
     bare = address.removeprefix("http://").rstrip("/")
+    if bare.isdigit():
+        bare = f"127.0.0.1:{bare}"
+    elif ":" not in bare.rpartition("]")[2]:
+        bare = f"{bare}:{_PORT}"
     try:
         if address.startswith("https://"):
             raise UsageError(address)
-        parsed = parse_address(f"tcp://127.0.0.1:{bare}" if bare.isdigit() else f"tcp://{bare}")
+        parsed = parse_address(f"tcp://{bare}")
     except UsageError:
         raise UsageError(
-            f"'{address}' is not the address of a status page; expected HOST:PORT, such as 127.0.0.1:8080"
+            f"'{address}' is not the address of a status page; expected HOST:PORT, such as 127.0.0.1:{_PORT}"
         ) from None
     host = f"[{parsed.host}]" if ":" in parsed.host else parsed.host
     return f"http://{host}:{parsed.port}/"

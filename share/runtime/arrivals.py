@@ -170,17 +170,18 @@ class LateFrameDropper:
         return frame, is_late
 
 
-_HEADSET_LATE_MS = 100.0  # a headset whose pose is older is better served by a prediction
+# an older pose is worse than a prediction: a wearer sees it; a robot's bridge holds one of 0.5 s for lost
+_LATE_MS = {AgentKind.AR: 100.0, AgentKind.ROBOT: 400.0}
 
 
 def late_limit_ms(late_ms: float | None, hello: Hello) -> float:
     """Return the delay from which a frame is not tracked; 0: all are. late_ms: as in the configuration.
 
-    By default a headset stays fresh where its IMU can predict its pose; a robot rather waits."""
+    By default an agent stays fresh where its IMU can predict its pose, a headset more than a robot."""
     if late_ms is not None:
         return late_ms
     can_predict = hello.rig.imu is not None and not hello.streams_frames
-    return _HEADSET_LATE_MS if hello.kind is AgentKind.AR and can_predict else 0.0
+    return _LATE_MS[hello.kind] if can_predict else 0.0
 
 
 _WINDOW = 100  # frames

@@ -146,7 +146,8 @@ def test_a_headset_with_an_imu_stays_fresh_by_default() -> None:
     assert late_limit_ms(None, headset) == 100.0
     assert late_limit_ms(None, replace(headset, rig=replace(headset.rig, imu=None))) == 0.0
     assert late_limit_ms(None, replace(headset, streams_frames=True)) == 0.0
-    assert late_limit_ms(None, robot) == late_limit_ms(0.0, headset) == 0.0
+    assert late_limit_ms(None, robot) == 400.0  # a bridge holds poses of 0.5 s for lost
+    assert late_limit_ms(0.0, robot) == late_limit_ms(0.0, headset) == 0.0
     assert late_limit_ms(50.0, robot) == 50.0
 
 
