@@ -18,8 +18,8 @@ from share.runtime.edge_observer import EdgeObserver
 from share.types import F64
 from share.wire.messages import Hello, PoseUpdate
 
-_STEP_M = 0.1  # between points of a path
-_MAX_POINTS = 600  # of a segment's path; beyond, every second is left out
+_STEP_M, _MAX_STEP_M = 0.1, 0.2  # between points of a path; more, and it cuts across a bend
+_MAX_POINTS = 600  # of a segment's path; beyond, every second is left out, and then the oldest are
 _MAX_SEGMENTS = 8  # of a run; the oldest are forgotten
 _KEPT_KEYFRAMES = 64  # newest, of a run; poses are relative to one of them
 _UPDATE_EVERY = 4  # poses come twenty times a second
@@ -37,8 +37,9 @@ class _PathSegment:
         if self.path and hypot(x - self.path[-1][0], y - self.path[-1][1]) < self.step_m:
             return
         self.path.append((x, y))
-        if len(self.path) > _MAX_POINTS:
+        if len(self.path) > _MAX_POINTS and self.step_m < _MAX_STEP_M:
             self.path, self.step_m = self.path[::2], 2 * self.step_m
+        del self.path[:-_MAX_POINTS]
 
     def in_map(self, points: Sequence[tuple[float, float]]) -> list[list[float]]:
         """Return points in the map, m to a centimetre; none without a correction."""

@@ -32,7 +32,8 @@ th, td { padding: .25rem .75rem .25rem 0; text-align: right; white-space: nowrap
 th { color: var(--dim); font-weight: 500; border-bottom: 1px solid var(--line) }
 td { border-bottom: 1px solid var(--line) }
 .words th:nth-child(-n+5), .words td:nth-child(-n+5), th:first-child, td:first-child { text-align: left }
-td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
+td { max-width: 11rem; overflow: hidden; text-overflow: ellipsis }
+td:first-child { max-width: 14rem }
 #maps th:last-child, #maps td:last-child { text-align: left; white-space: normal }
 #consistency td { text-align: left; vertical-align: top }
 #consistency th { text-align: left }
@@ -42,7 +43,7 @@ tr.gone { color: var(--dim) }
 .stale { opacity: .45 }
 #plan { display: flex; flex-wrap: wrap; gap: 1rem }
 #plan figure { margin: 0; flex: 1 1 20rem; min-width: 0; max-width: 36rem }
-#plan figcaption { color: var(--dim) }
+#plan figcaption { color: var(--dim); overflow-wrap: anywhere }
 #plan svg { width: 100%; height: auto; max-height: 22rem; border: 1px solid var(--line); border-radius: 4px }
 #plan text { fill: currentColor }
 @media (max-width: 48rem) {
@@ -54,7 +55,7 @@ tr.gone { color: var(--dim) }
   td, td:first-child, #agents td:nth-child(4), #consistency td:nth-child(3) {
     display: flex; justify-content: space-between; gap: .6rem; border: 0; padding: .1rem 0; max-width: none;
     min-width: 0; text-align: right; white-space: normal; overflow-wrap: anywhere }
-  td::before { content: attr(data-label); color: var(--dim); flex: none; text-align: left }
+  td::before { content: attr(data-label); color: var(--dim); flex: 0 1 auto; min-width: 4rem; text-align: left }
   td:first-child { grid-column: 1 / -1; font-weight: 600; justify-content: flex-start }
   td:first-child::before { display: none }
   td[data-label=reason] { grid-column: 1 / -1 }
