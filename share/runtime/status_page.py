@@ -55,7 +55,8 @@ tr.gone { color: var(--dim) }
   td, td:first-child, #agents td:nth-child(4), #consistency td:nth-child(3) {
     display: flex; justify-content: space-between; gap: .6rem; border: 0; padding: .1rem 0; max-width: none;
     min-width: 0; text-align: right; white-space: normal; overflow-wrap: anywhere }
-  td::before { content: attr(data-label); color: var(--dim); flex: 0 1 auto; min-width: 4rem; text-align: left }
+  td::before { content: attr(data-label); color: var(--dim); flex: 0 1 auto; min-width: 4rem;
+               text-align: left }
   td:first-child { grid-column: 1 / -1; font-weight: 600; justify-content: flex-start }
   td:first-child::before { display: none }
   td[data-label=reason] { grid-column: 1 / -1 }
