@@ -45,6 +45,9 @@ _HELD = 1.5  # how much more a step must gain another agent than one that has it
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
 _LEAST_AIR_S = 1e-3
+_LEAST_AIR_PART = (
+    0.75  # of the usual T, which an agent takes at least: no link is much faster than its room's
+)
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
@@ -119,7 +122,11 @@ class RoomBudget:
         return RoomBudget({n: a for n, a in self.agents.items() if n != name})
 
     def air_s(self, agent: AgentAir) -> float:
-        """Return T of an agent, s."""
+        """Return T of an agent, s: at least a part of what is usual, since all share the air."""
+        return max(self._own_air_s(agent), _LEAST_AIR_PART * (self.usual_air_s or 0.0))
+
+    def _own_air_s(self, agent: AgentAir) -> float:
+        """Return T of an agent by its own report, s."""
         return agent.keyframe_s * self._idle / (1 + agent.keyframe_s * self._keyframes_hz)
 
     @property
@@ -138,11 +145,11 @@ class RoomBudget:
         """1 - M c, bounded where an agent claims what no air carries."""
         return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
-    @property
+    @cached_property
     def usual_air_s(self) -> float | None:
         """T in the median of all agents, s: that of one is noisy, or false; of two the lesser. None without
         an agent."""
-        times = [self.air_s(agent) for agent in self.agents.values()]
+        times = [self._own_air_s(agent) for agent in self.agents.values()]
         return None if not times else median(times) if len(times) > 2 else min(times)
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:

@@ -1,7 +1,8 @@
-"""Whether the room can serve one more agent: what it would do to the delay of headsets.
+"""Whether the room can serve one more agent: how long keyframes would then take on the air.
 
-All send at their least rates; beyond the tolerated delay nothing is left to yield. Robots leave first: a
-headset that finds no room takes the place of robots, and is refused where that is not enough.
+All send at their least rates; beyond what headsets tolerate nothing is left to yield. Only the air counts:
+an agent that is slow or far away is late whoever else is there. Robots leave first: a headset that finds no
+room takes the place of robots, and is refused where that is not enough.
 """
 
 from __future__ import annotations
@@ -15,18 +16,19 @@ from share.timing import seconds_to_ns
 from share.types import AgentKind
 
 TOLERATED_DELAY_MS = 200.0  # of a headset's corrections; more is shown as its trouble
-_LIMIT = f"{TOLERATED_DELAY_MS:.0f} ms"
+TOLERATED_AIR_MS = TOLERATED_DELAY_MS - 60.0  # the air's part: the rest is what they take on ample air
+_LEAST_WITNESSES = 2  # the word of one agent refuses nobody
 _MUCH_MS = 10_000.0
 _SETTLED_S = 10.0  # for so long the room must have been full: a pause of the edge or of the air is none
 
 
 @dataclass(frozen=True)
 class RoomCapacity:
-    """Capacity at the last check. delay_ms: predicted delay of headsets with one more agent,
-    by its form. full_since_ns: since when that has been too much. leaving: robots that would make room for
+    """Capacity at the last check. air_ms: how long a keyframe would take on the air with one more agent, by
+    its form. full_since_ns: since when that has been too much. leaving: robots that would make room for
     one more headset, by name, the newest first; leaving_since_ns: since when there have been any."""
 
-    delay_ms: Mapping[AgentKind, float] = field(default_factory=dict)
+    air_ms: Mapping[AgentKind, float] = field(default_factory=dict)
     full_since_ns: Mapping[AgentKind, int] = field(default_factory=dict)
     leaving: tuple[str, ...] = ()
     leaving_since_ns: int | None = None
@@ -36,28 +38,30 @@ class RoomCapacity:
         robots = [name for name, one in budget.agents.items() if one.terms.form is AgentKind.ROBOT]
         has_headset = len(robots) < len(budget.agents)
         leaving = list[str]()
-        headset_ms = headset_delay_ms(budget, AgentKind.AR)
-        while headset_ms > TOLERATED_DELAY_MS and robots:
+        headset_ms = crowded_air_ms(budget, AgentKind.AR)
+        while headset_ms > TOLERATED_AIR_MS and robots:
             leaving.append(robots.pop())
-            headset_ms = headset_delay_ms(budget, AgentKind.AR, leaving)
-        robot_ms = headset_delay_ms(budget, AgentKind.ROBOT) if has_headset else 0.0
-        delay_ms = {AgentKind.AR: headset_ms, AgentKind.ROBOT: robot_ms}
+            headset_ms = crowded_air_ms(budget, AgentKind.AR, leaving)
+        robot_ms = crowded_air_ms(budget, AgentKind.ROBOT) if has_headset else 0.0
+        air_ms = {AgentKind.AR: headset_ms, AgentKind.ROBOT: robot_ms}
+        if headset_ms > TOLERATED_AIR_MS:
+            leaving.clear()  # it would not be enough: they go for nobody
         full_since_ns = {
-            form: self.full_since_ns.get(form, now_ns)
-            for form, ms in delay_ms.items()
-            if ms > TOLERATED_DELAY_MS
+            form: self.full_since_ns.get(form, now_ns) for form, ms in air_ms.items() if ms > TOLERATED_AIR_MS
         }
         before_ns = now_ns if self.leaving_since_ns is None else self.leaving_since_ns
-        return RoomCapacity(delay_ms, full_since_ns, tuple(leaving), before_ns if leaving else None)
+        return RoomCapacity(air_ms, full_since_ns, tuple(leaving), before_ns if leaving else None)
 
     def objection(self, form: AgentKind, now_ns: int) -> str | None:
         """Return why the room cannot serve one more agent of a form, for a person; None if it can."""
         if not _is_settled(self.full_since_ns.get(form), now_ns):
             return None
         kind = "headset" if form is AgentKind.AR else "robot"
-        ms = self.delay_ms[form]
+        ms = self.air_ms[form]
         how_long = f"{ms:.0f} ms" if ms < _MUCH_MS else "seconds"
-        return f"no air for one more {kind}: corrections of headsets would take {how_long}, {_LIMIT} at most"
+        return (
+            f"no air for one more {kind}: a keyframe would take {how_long}, {TOLERATED_AIR_MS:.0f} ms at most"
+        )
 
     def displaced(self, form: AgentKind, now_ns: int) -> tuple[str, ...]:
         """Return the robots that have to leave for one more agent of a form."""
@@ -65,19 +69,15 @@ class RoomCapacity:
         return self.leaving if is_crowded else ()
 
 
-def headset_delay_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[str] = ()) -> float:
-    """Return the delay of headsets once one agent has joined and others have left, all at their least rates;
-    inf beyond what the air carries, 0 in an empty room, of which nothing is known."""
-    if not budget.agents:
+def crowded_air_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[str] = ()) -> float:
+    """Return how long a keyframe takes on the air, T / (1 - load), once one agent has joined and others have
+    left, all at their least rates; inf beyond what the air carries, 0 where too few know the air."""
+    if len(budget.agents) < _LEAST_WITNESSES:
         return 0.0
-    staying = [agent for name, agent in budget.agents.items() if name not in leaving]
+    staying = [agent.terms.form for name, agent in budget.agents.items() if name not in leaving]
     air_s = _lower_quartile(map(budget.air_s, budget.agents.values()))
-    load = sum(least_load(form, air_s) for form in [joining, *(agent.terms.form for agent in staying)])
-    if load >= MAX_LOAD:
-        return math.inf
-    headsets = [agent for agent in staying if agent.terms.form is AgentKind.AR]
-    other_delay_ms = _lower_quartile(one.other_delay_ms for one in headsets or budget.agents.values())
-    return other_delay_ms + 1e3 * air_s / (1 - load)
+    load = sum(least_load(form, air_s) for form in [joining, *staying])
+    return math.inf if load >= MAX_LOAD else 1e3 * air_s / (1 - load)
 
 
 def _lower_quartile(values: Iterable[float]) -> float:

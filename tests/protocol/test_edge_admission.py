@@ -319,12 +319,12 @@ def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none()
     assert refusal(tell(few, 100, robot("late", 100), now_s)) is None
 
     crowded = Edge(Config(), 7)
-    now_s = evaluated(crowded, 14 * headset + 5 * bot)
+    now_s = evaluated(crowded, 15 * headset + 5 * bot)
     assert "no air for one more robot" in refusal(tell(crowded, 100, robot("late", 100), now_s))
     assert "no air left beside headsets" in refusal(come(crowded, "eve", 101, now_s))
     agents = crowded.report({})["agents"]
     assert not agents["eve"]["gone"]
-    assert [name for name, agent in agents.items() if agent["gone"]] == ["a17", "a18"]
+    assert [name for name, agent in agents.items() if agent["gone"]] == ["a18", "a19"]
 
     full = Edge(Config(), 7)
     now_s = evaluated(full, 20 * headset)

@@ -100,6 +100,29 @@ def test_slow_air_that_few_share_is_not_short() -> None:
     assert room(agent(keyframe_ms=54.0)).allocate()["a0"].hz == 1.5
 
 
+@pytest.mark.parametrize("honest", [2, 4, 8])
+def test_an_agent_that_claims_to_take_no_air_gains_little_and_delays_nobody(honest: int) -> None:
+    """On 60 ms of air; it claims to drift as well, so that a step gains it more than others."""
+    others = [agent(keyframe_ms=70.0, wanted_hz=5.0, pose_hz=5.0, hz=0.5)] * honest
+    liar = replace(others[0], keyframe_s=0.0, delay_ms=60.0, error_cm=5.0, drift_cm=5.0)
+    usual, granted = room(*others, others[0]).allocate(), room(*others, liar).allocate()
+    assert granted[f"a{honest}"].hz <= 6 * granted["a0"].hz
+    alone_s = room(*others).air_s(others[0])
+
+    def load(grants: dict[str, RateGrant]) -> float:
+        return sum(alone_s * g.hz + (SCARCE_POSE_HZ[AR] + 8) * message_s(alone_s) for g in grants.values())
+
+    assert (1 - load(usual)) / (1 - load(granted)) < 1.25
+
+
+def test_an_agent_with_a_faster_link_counts_as_such_in_part() -> None:
+    budget = room(agent(), agent(), agent(), agent(keyframe_ms=36.0), agent(keyframe_ms=4.0))
+    usual = budget.usual_air_s
+    assert usual is not None and budget.air_s(budget.agents["a0"]) == usual
+    assert 0.75 * usual < budget.air_s(budget.agents["a3"]) < usual
+    assert budget.air_s(budget.agents["a4"]) == 0.75 * usual
+
+
 def test_more_goes_to_whom_it_gains_more() -> None:
     """Two headsets on 18 ms of air; one drifts."""
     drifts, is_still = (
