@@ -17,7 +17,7 @@ from share.types import AgentKind
 
 TOLERATED_DELAY_MS = 200.0  # of a headset's corrections; more is shown as its trouble
 TOLERATED_AIR_MS = TOLERATED_DELAY_MS - 60.0  # the air's part: the rest is what they take on ample air
-_LEAST_WITNESSES = 2  # the word of one agent refuses nobody
+_MIN_REPORTS = 2  # what one agent reports refuses nobody
 _MUCH_MS = 10_000.0
 _SETTLED_S = 10.0  # for so long the room must have been full: a pause of the edge or of the air is none
 
@@ -72,7 +72,7 @@ class RoomCapacity:
 def crowded_air_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[str] = ()) -> float:
     """Return how long a keyframe takes on the air, T / (1 - load), once one agent has joined and others have
     left, all at their least rates; inf beyond what the air carries, 0 where too few know the air."""
-    if len(budget.agents) < _LEAST_WITNESSES:
+    if len(budget.agents) < _MIN_REPORTS:
         return 0.0
     staying = [agent.terms.form for name, agent in budget.agents.items() if name not in leaving]
     air_s = _lower_quartile(map(budget.air_s, budget.agents.values()))
