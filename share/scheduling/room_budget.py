@@ -45,9 +45,7 @@ _HELD = 1.5  # how much more a step must gain another agent than one that has it
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
 _LEAST_AIR_S = 1e-3
-_LEAST_AIR_PART = (
-    0.75  # of the usual T, which an agent takes at least: no link is much faster than its room's
-)
+_LEAST_AIR_PART = 0.75  # of the usual T: an agent takes at least this, since all share one air
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
