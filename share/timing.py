@@ -47,11 +47,13 @@ class TokenBucket:
         self._refilled_ns: int | None = None
 
     def set_rate(self, hz: float | None, now_ns: int) -> None:
-        """Set a new rate; saved tokens stay, but where nothing was limited there are none."""
+        """Set a new rate; saved tokens stay."""
         self._refill(now_ns)
-        if self.hz is None and hz is not None:
-            self._tokens = 0.0
         self.hz = hz
+
+    def empty(self) -> None:
+        """Take all tokens that are saved."""
+        self._tokens = 0.0
 
     def take(self, now_ns: int, preferred: bool = True, cost: float = 1.0) -> bool:
         """Take `cost` tokens. Return whether the item may pass now."""

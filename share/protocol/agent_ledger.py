@@ -31,6 +31,7 @@ class LedgerEntry:
     send_count: int = 0  # sends that the link took, in all sessions
     due_ns: int | None = None  # None: now
     sent_ns: int = 0
+    is_refused: bool = False  # by the link, when it was sent last
     is_replayed: bool = False  # an earlier session of the edge had acknowledged it
     is_corrected: bool = False  # a correction has answered it
 
@@ -120,7 +121,7 @@ class KeyframeLedger:
             backoff = RESEND_S * 2.0 ** min(entry.attempts, 30)
             entry.due_ns = now_ns + seconds_to_ns(min(backoff, RESEND_MAX_S))
             entry.attempts += 1
-            entry.sent_ns = now_ns
+            entry.sent_ns, entry.is_refused = now_ns, False
             self._max_sent_id = max(self._max_sent_id, entry.keyframe.id)
         self._max_ever_sent_id = max(self._max_ever_sent_id, self._max_sent_id)
         return due
@@ -133,6 +134,7 @@ class KeyframeLedger:
         """Record that the link did not take this keyframe. It is due again after its backoff."""
         if (entry := self.find(keyframe)) is not None and entry.send_count:
             self._count_sends(entry, -1)
+            entry.is_refused = True
 
     def _count_sends(self, entry: LedgerEntry, change: int) -> None:
         """Count `change` sends of an entry: the first as `sent`, others as `resent`."""
@@ -198,7 +200,8 @@ class KeyframeLedger:
     def _is_due(self, entry: LedgerEntry, now_ns: int) -> bool:
         if entry.keyframe.id in self._buffered_at_edge and entry.keyframe.id != next(iter(self._pending)):
             return False  # not for the oldest: the edge may wait for a keyframe that was dropped here
-        return entry.due_ns is None or (entry.due_ns <= now_ns and entry.sent_ns < self._heard_before_ns)
+        is_on_its_way = not entry.is_refused and entry.sent_ns >= self._heard_before_ns
+        return entry.due_ns is None or (entry.due_ns <= now_ns and not is_on_its_way)
 
     def _make_all_due(self) -> None:
         self._buffered_at_edge = frozenset()

@@ -101,7 +101,7 @@ def test_the_cost_of_a_query_is_bounded(path, monkeypatch):
     """Rows of other topics may be any number."""
     monkeypatch.setattr("share.files.sqlite_file._MIN_STEPS", 1000)
     monkeypatch.setattr("share.files.sqlite_file._STEPS_PER_BYTE", 0)
-    monkeypatch.setattr("share.files.sqlite_file._STEPS_PER_CHECK", 100)
+    monkeypatch.setattr("share.files.sqlite_file.STEPS_PER_CHECK", 100)
     with pytest.raises(DataError, match="interrupted"):
         open_source(str(path))
 
