@@ -51,9 +51,9 @@ class TokenBucket:
         self._refill(now_ns)
         self.hz = hz
 
-    def empty(self) -> None:
-        """Take all tokens that are saved."""
-        self._tokens = 0.0
+    def limit_saved(self, most: float) -> None:
+        """Take the saved tokens beyond `most`."""
+        self._tokens = min(self._tokens, most)
 
     def take(self, now_ns: int, preferred: bool = True, cost: float = 1.0) -> bool:
         """Take `cost` tokens. Return whether the item may pass now."""

@@ -354,5 +354,7 @@ def _near_few(rho: F64) -> NDArray[np.bool_]:
 
     They say the most about translation: one who stands before the camera and sways outweighs a room.
     """
+    if not len(rho):
+        return np.zeros(0, bool)
     near: NDArray[np.bool_] = rho > _NEAR_RATIO * np.median(rho)
     return near if near.mean() < _MAX_NEAR_SHARE else np.zeros(len(rho), bool)

@@ -48,10 +48,10 @@ class KeyframePace:
         return max(now_ns, self._held_until_ns)
 
     def set_rate(self, rate: Rate, now_ns: int) -> None:
-        """Take what the edge asks for. Where nothing was limited, nothing is saved: twelve agents that are
-        limited at once do not send twelve bursts."""
+        """Take what the edge asks for. Where nothing was limited, one keyframe goes at once: of twelve agents
+        that are limited at once, bursts would fill the air."""
         if self._bucket.hz is None:
-            self._bucket.empty()
+            self._bucket.limit_saved(1.0)
         self._bucket.set_rate(max(rate.hz, _MIN_RATE_HZ), now_ns)
         self._poses.set_rate(rate.pose_hz, now_ns)
         if not rate.is_windowed:
