@@ -147,9 +147,9 @@ def test_a_port_in_use_is_reported_before_a_process_starts(room: LiveRoom) -> No
 
 def soon(is_true: Callable[[], bool], within_s: float = 20.0) -> bool:
     deadline = time.monotonic() + within_s
-    while not is_true() and time.monotonic() < deadline:
+    while not (found := is_true()) and time.monotonic() < deadline:
         time.sleep(0.02)
-    return is_true()
+    return found
 
 
 @needs_viser
