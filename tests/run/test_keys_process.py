@@ -118,7 +118,7 @@ def test_keys_by_command(tmp_path: Path) -> None:
     assert listed == {
         "folder": str(tmp_path),
         "own": {"name": "edge", "public_key": own},
-        "authorized": [{"name": "headset", "public_key": other, "agents": ["headset"]}],
+        "authorized": [{"name": "headset", "public_key": other, "agents": ["headset"], "may": []}],
     }
     assert keys(tmp_path, "list").splitlines() == [f"{own}  edge (this machine)", f"{other}  headset"]
     keys(tmp_path, "revoke", "headset")
