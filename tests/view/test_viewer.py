@@ -220,8 +220,9 @@ def test_a_thread_that_serves_no_browser_stops_the_heartbeat() -> None:
         try:
             loop = window._server._event_loop
             assert soon(window.has_served)
-            hangs = threading.Event()
-            loop.call_soon_threadsafe(hangs.wait)
+            began, hangs = threading.Event(), threading.Event()
+            loop.call_soon_threadsafe(lambda: (began.set(), hangs.wait()))
+            assert began.wait(20.0)  # what was asked before has been answered
             window.has_served()
             assert not soon(window.has_served, within_s=0.5)
             hangs.set()
