@@ -9,30 +9,11 @@ from contextlib import closing
 
 import click
 import pytest
+from helpers.terminal_room import PLAN, REPORT, Terminal
 
 from share.cli.terminal import LiveLine
 from share.cli.terminal_room import TerminalRoom, has_room
 from share.runtime.status_server import StatusServer
-
-REPORT = {
-    "agents": {
-        "ann": {
-            **{"kind": "ar", "state": "OK", "pose_ms": 6.0, "qoe": 0.8, "qoe_target": 0.75, "rate_hz": 3.2},
-            **{"keyframes": 12, "gone": False, "trouble": []},
-        }
-    }
-}
-PART = {"map_id": "a", "path": [[0.0, 0.0], [1.0, 0.0]]}
-PLAN = {
-    "agents": {"ann": {"kind": "ar", "map_id": "a", "parts": [PART], "position": [1.0, 0.0], "heading": 0.0}}
-}
-
-
-class Terminal(io.StringIO):
-    encoding = "utf-8"
-
-    def isatty(self) -> bool:
-        return True
 
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> Terminal:

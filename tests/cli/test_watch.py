@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import socket
@@ -17,6 +16,8 @@ from typing import Any
 import click
 import pytest
 from click.testing import CliRunner, Result
+from helpers import terminal_room
+from helpers.terminal_room import PLAN, Terminal
 
 from share.cli.main import cli
 from share.cli.watch import watch as watch_command
@@ -24,22 +25,7 @@ from share.errors import ShareError, UsageError, printable
 from share.net.http_guard import read_token
 from share.runtime.status_server import StatusServer
 
-AGENT = {
-    **{"kind": "ar", "state": "OK", "pose_ms": 6.0, "qoe": 0.8, "qoe_target": 0.75, "rate_hz": 3.2},
-    **{"keyframes": 12, "gone": False, "trouble": []},
-}
-REPORT = {"agents": {"ann": AGENT}, "trouble": []}
-PART = {"map_id": "a", "path": [[0.0, 0.0], [1.0, 0.0]]}
-PLAN = {
-    "agents": {"ann": {"kind": "ar", "map_id": "a", "parts": [PART], "position": [1.0, 0.0], "heading": 0.0}}
-}
-
-
-class Terminal(io.StringIO):
-    encoding = "utf-8"
-
-    def isatty(self) -> bool:
-        return True
+REPORT = terminal_room.REPORT | {"trouble": []}
 
 
 def watch(*words: object) -> Result:
