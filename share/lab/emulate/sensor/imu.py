@@ -147,9 +147,8 @@ def rotation_rates(acceleration: F64) -> F64:
 
 def _gauss_markov(white: F64, decay: float) -> F64:
     """Return x_k = a x_{k-1} + sqrt(1 - a^2) w_k for w (N, ...) and a = `decay`, stationary."""
-    from scipy.signal import lfilter
-
-    white = white.copy()
-    white[1:] *= np.sqrt(1 - decay * decay)
-    out: F64 = lfilter([1.0], [1.0, -decay], white, axis=0)
+    out = white.copy()
+    out[1:] *= np.sqrt(1 - decay * decay)
+    for k in range(1, len(out)):
+        out[k] += decay * out[k - 1]
     return out
