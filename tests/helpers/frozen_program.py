@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = ROOT / "dist" / "share" / "share"
 SOURCES = ["Makefile", "setup.cfg", "share/**/*.py", "tools/share.spec", "tools/frozen_entry.py"]
-SOURCES += ["tools/slim.py", "tools/stub_library.py", "tools/no_highs.py"]
+SOURCES += ["tools/slim.py", "tools/stub_library.py", "tools/left_out.py"]
 
 
 def frozen_program() -> Path:
