@@ -70,6 +70,11 @@ COMMANDS = {
         "camera_imu",
         "Calibrate camera-IMU extrinsics and time offset.",
     ),
+    "calibrate headset": (
+        "share.cli.calibrate_headset",
+        "headset",
+        "Calibrate where a headset's own tracking sits on the device.",
+    ),
     "calibrate imu": (
         "share.cli.calibrate_imu",
         "imu",

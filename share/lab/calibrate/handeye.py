@@ -88,23 +88,43 @@ def _cauchy_weights(size: F64) -> F64:
 
 
 def _refine(A: F64, B: F64, X: F64, rotation_rms_by_axis: F64) -> HandEye:
-    """Refine rotation and translation together by Gauss-Newton from X, each weighted by its residuals.
-
-    Exp(xi) on the right of X changes Log(B^-1 X^-1 A X) by xi - Ad(B^-1) xi.
-    """
-    J = np.eye(6) - se3.adjoint(se3.inverse(B))
-    weight = np.ones(len(A))
+    """Refine rotation and translation together by Gauss-Newton from X, each weighted by its residuals."""
+    J = motion_jacobian(B)
     for _ in range(_ITERATIONS):
-        residuals = se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
-        rms = [
-            float(np.sqrt(np.average((part**2).sum(1), weights=weight))) for part in np.split(residuals, 2, 1)
-        ]
+        step, cov, rms = robust_step(motion_residuals(A, B, X), J)
+        X = X @ se3.exp(step)
+    return HandEye(X, cov, rotation_rms_by_axis, rms[0], len(A))
+
+
+def motion_residuals(A: F64, B: F64, X: F64) -> F64:
+    """Return Log(B^-1 X^-1 A X) (N, 6): rotation rad, translation m."""
+    return se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
+
+
+def motion_jacobian(B: F64) -> F64:
+    """Return the derivative (N, 6, 6) of `motion_residuals` by xi of X Exp(xi): xi - Ad(B^-1) xi."""
+    return np.asarray(np.eye(6) - se3.adjoint(se3.inverse(B)), np.float64)
+
+
+def robust_step(residuals: F64, J: F64) -> tuple[F64, F64, tuple[float, float]]:
+    """Return the Gauss-Newton step (P,) of residuals (N, 6) with derivatives J (N, 6, P), its covariance
+    (P, P) for independent motions, and the weighted rms of rotation, rad, and translation, m.
+
+    Rotation and translation are weighted by their rms, motions by Cauchy. Raises np.linalg.LinAlgError where
+    the motions do not determine all.
+    """
+    weight, rms = np.ones(len(residuals)), (0.0, 0.0)
+    for _ in range(2):  # the rms without the outliers that it finds
+        rotation, translation = (
+            float(np.sqrt(np.average((part**2).sum(1), weights=weight)))
+            for part in np.split(residuals, 2, axis=1)
+        )
+        rms = rotation, translation
         sigma = np.repeat(np.maximum(rms, 1e-12), 3) / np.sqrt(3)
         weight = _cauchy_weights(np.linalg.norm(residuals / sigma, axis=1))
-        JW = J / sigma[:, None] ** 2 * weight[:, None, None]
-        cov = np.linalg.inv(np.einsum("nij,nik->jk", JW, J))
-        X = X @ se3.exp(-cov @ np.einsum("nij,ni->j", JW, residuals))
-    return HandEye(X, cov, rotation_rms_by_axis, rms[0], len(A))
+    JW = J / sigma[:, None] ** 2 * weight[:, None, None]
+    cov = np.linalg.inv(np.einsum("nij,nik->jk", JW, J))
+    return -cov @ np.einsum("nij,ni->j", JW, residuals), cov, rms
 
 
 # Check of a mounting from another source by hand-eye.
@@ -133,19 +153,22 @@ def check_mounting(T_a_b: F64, stamps_ns: I64, T_a: F64, T_b: F64) -> HandEyeChe
 
     Raises DataError where the paths are too short, or turn about one axis only.
     """
-    first, last = _motion_ends(stamps_ns)
+    first, last = motion_ends(stamps_ns)
     if not len(first):
         raise DataError("hand-eye: the two paths overlap by less than a second; are they of one recording?")
-    estimate = hand_eye(_relative_motions(T_a, first, last), _relative_motions(T_b, first, last))
+    estimate = hand_eye(relative_motions(T_a, first, last), relative_motions(T_b, first, last))
     error = se3.log(se3.inverse(estimate.T_a_b) @ T_a_b)
-    # overlapping motions are not independent
-    overlap_factor = max(1.0, _MOTION_NS / float(np.median(np.diff(stamps_ns))))
-    sigmas = np.sqrt(error @ np.linalg.solve(estimate.cov * overlap_factor, error) / len(error))
+    sigmas = np.sqrt(error @ np.linalg.solve(estimate.cov * overlap_factor(stamps_ns), error) / len(error))
     rotation_error, translation_error = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     return HandEyeCheck(estimate, float(rotation_error), float(translation_error), float(sigmas))
 
 
-def _motion_ends(stamps_ns: I64) -> tuple[I64, I64]:
+def overlap_factor(stamps_ns: I64) -> float:
+    """Return how many motions of `motion_ends` overlap: they are not independent."""
+    return max(1.0, _MOTION_NS / float(np.median(np.diff(stamps_ns))))
+
+
+def motion_ends(stamps_ns: I64) -> tuple[I64, I64]:
     """Return the indices (M,) where motions of about a second begin and end; none spans a gap."""
     last = np.searchsorted(stamps_ns, stamps_ns + _MOTION_NS)
     first = np.flatnonzero(last < len(stamps_ns))
@@ -153,5 +176,6 @@ def _motion_ends(stamps_ns: I64) -> tuple[I64, I64]:
     return first[near], last[first[near]]
 
 
-def _relative_motions(T: F64, first: I64, last: I64) -> F64:
+def relative_motions(T: F64, first: I64, last: I64) -> F64:
+    """Return T[first]^-1 T[last]."""
     return np.asarray(se3.inverse(T[first]) @ T[last], np.float64)

@@ -49,6 +49,16 @@ def chain_heading(command: str, source: str, passed: bool, report: str) -> str:
     return f"share calibrate {command} {source}: {'passed' if passed else f'FAILED, see {report}'}"
 
 
+def matrix_lines(matrix: F64) -> list[str]:
+    """Return a matrix (N, M) as lines of YAML, one a row."""
+    return [f"- {yaml_list(row)}" for row in matrix]
+
+
+def yaml_list(values: F64) -> str:
+    """Return numbers as a list of YAML, nine digits each."""
+    return "[" + ", ".join(f"{value:.9g}" for value in values) + "]"
+
+
 def cells_with_sigmas(values: F64, sigmas: F64, digits: int) -> list[str]:
     """Return texts such as "+1.23 ± 0.04"."""
     return [f"{v:+.{digits}f} ± {s:.{digits}f}" for v, s in zip(values, sigmas, strict=True)]

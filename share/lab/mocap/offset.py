@@ -38,25 +38,33 @@ class OffsetPeak:
 
 
 def find_offset(imu: ImuBatch, mocap: MocapTrajectory, within_s: float | None) -> OffsetPeak:
-    """Find the offset with the best correlation. within_s: search range; None: all offsets with an overlap of
-    5 s (or nearly all of the shorter).
+    """Find the offset of the IMU's clock from the mocap's by `correlate_rotations`."""
+    return correlate_rotations(imu_rotations(imu), mocap_rotations(mocap), within_s, ("mocap", "IMU"))
 
-    Raises CalibrationMismatchError if the rotations match at no offset.
+
+def correlate_rotations(
+    a: tuple[I64, F64], b: tuple[I64, F64], within_s: float | None, names: tuple[str, str]
+) -> OffsetPeak:
+    """Find the offset with the best correlation of rotations a and b: centres (N,) ns and vectors (N, 3)
+    rad of each.
+
+    within_s: search range; None: all offsets with an overlap of 5 s (or nearly all of the shorter). names:
+    of b and a. Raises CalibrationMismatchError if the rotations match at no offset.
     """
-    a, a_ok, a_start = _angles_on_grid(*imu_rotations(imu))
-    b, b_ok, b_start = _angles_on_grid(*mocap_rotations(mocap))
-    is_plausible = b <= 1.5 * a.max()  # faster rotations are mocap outliers
-    b, b_ok = b * is_plausible, b_ok * is_plausible
-    score, count = _masked_correlation(a, a_ok, b, b_ok)
-    lags = np.arange(len(score)) - (len(b) - 1)  # a[i + lag] belongs to b[i]
+    a_angles, a_ok, a_start = _angles_on_grid(*a)
+    b_angles, b_ok, b_start = _angles_on_grid(*b)
+    is_plausible = b_angles <= 1.5 * a_angles.max()  # faster rotations are outliers
+    b_angles, b_ok = b_angles * is_plausible, b_ok * is_plausible
+    score, count = _masked_correlation(a_angles, a_ok, b_angles, b_ok)
+    lags = np.arange(len(score)) - (len(b_angles) - 1)  # a[i + lag] belongs to b[i]
     offsets = (a_start - b_start) + lags * _OFFSET_STEP_NS
     if within_s is not None:
         score = np.where(np.abs(offsets) <= within_s * 1e9, score, -1.0)
     if score.max() < _MIN_CORRELATION:
         raise CalibrationMismatchError(
-            f"the rotations of mocap and IMU match at no time offset (correlation {score.max():.2f}, "
-            f"{_MIN_CORRELATION} needed); are both of one recording, the clocks as close as stated, and does "
-            "the body turn?"
+            f"the rotations of {names[0]} and {names[1]} match at no time offset (correlation "
+            f"{score.max():.2f}, {_MIN_CORRELATION} needed); are both of one recording, the clocks as "
+            "close as stated, and does the body turn?"
         )
     evidence = _log_evidence(score, count)
     best = int(np.where(score >= _MIN_CORRELATION, evidence, -1.0).argmax())
@@ -93,7 +101,7 @@ def imu_rotations(imu: ImuBatch) -> tuple[I64, F64]:
 
 
 def mocap_rotations(mocap: MocapTrajectory) -> tuple[I64, F64]:
-    """Return the same in the mocap body's frame, for windows without a gap."""
+    """Return the same in the frame of a tracked body, for windows without a gap."""
     start = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] - WINDOW_NS, _OFFSET_STEP_NS)
     start = start[mocap.is_covered(start) & mocap.is_covered(start + WINDOW_NS)]
     R0, R1 = mocap.interpolate(start)[:, :3, :3], mocap.interpolate(start + WINDOW_NS)[:, :3, :3]

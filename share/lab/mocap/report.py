@@ -11,6 +11,7 @@ import numpy as np
 from share.errors import UsageError
 from share.files.yaml_file import read_yaml
 from share.lab.calibrate.handeye import HandEyeCheck
+from share.lab.calibrate.report import matrix_lines, yaml_list
 from share.lab.mocap.fit import MocapFit
 from share.lab.mocap.verdict import fit_warnings, mounting_warning, shared_sigmas
 from share.types import F64
@@ -27,18 +28,18 @@ def mocap_yaml(fit: MocapFit, name: str, truth: str) -> str:
             f"# share calibrate mocap: {name} with {truth}",
             "# p_body = T_body_mocap p_mocap: from the motion capture's body to the IMU",
             "T_body_mocap:",
-            *_matrix_lines(fit.T_body_mocap),
+            *matrix_lines(fit.T_body_mocap),
             "# p_mocap = R_mocap_world p_world: the world is level, z up",
             "R_mocap_world:",
-            *_matrix_lines(fit.R_mocap_world),
+            *matrix_lines(fit.R_mocap_world),
             f"up: {fit.up}  # axis of the motion capture's world nearest to vertical; tilt: its angle to it",
             f"tilt_deg: {fit.tilt_deg:.5f}",
             f"timeshift_imu_mocap: {fit.offset_ns * 1e-9:.9f}  # s, IMU's clock minus mocap's, at mid-time",
             f"drift_ppm: {fit.drift_ppm:.3f}",
             "sigma:",
-            f"  rotation_deg: {_yaml_list(np.degrees(sigma[2:5]))}",
-            f"  position_m: {_yaml_list(sigma[5:8])}",
-            f"  tilt_deg: {_yaml_list(np.degrees(sigma[:2]))}",
+            f"  rotation_deg: {yaml_list(np.degrees(sigma[2:5]))}",
+            f"  position_m: {yaml_list(sigma[5:8])}",
+            f"  tilt_deg: {yaml_list(np.degrees(sigma[:2]))}",
             f"  timeshift_s: {sigma[8]:.3e}",
             f"  drift_ppm: {sigma[9] * 1e6:.3f}",
             "",
@@ -107,11 +108,3 @@ def _hand_eye_values(hand_eye_check: HandEyeCheck) -> dict[str, Any]:
         "motions": estimate.motions,
         "rotation_rms_deg": np.degrees(estimate.rotation_rms_by_axis).tolist(),
     }
-
-
-def _matrix_lines(values: np.ndarray) -> list[str]:
-    return [f"- {_yaml_list(row)}" for row in values]
-
-
-def _yaml_list(values: np.ndarray) -> str:
-    return "[" + ", ".join(f"{value:.9g}" for value in values) + "]"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,26 +21,31 @@ _MAX_HIDDEN_FACTOR = 100  # longer recordings: at most this times the time in wh
 @dataclass(frozen=True, eq=False)
 class MocapTrajectory:
     """Poses T (M, 4, 4) of the mocap's body (its markers') in the mocap's world at stamps_ns (M,), rising,
-    in the mocap's clock. Raises DataError for invalid ones."""
+    in the mocap's clock. source: what tracked it, for messages. Raises DataError for invalid ones."""
 
     stamps_ns: I64
     T: F64
+    source: str = "mocap"
 
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)
         if n < 2:
-            raise DataError(f"mocap: {n} poses; at least two are needed, record again")
-        check_stamps("mocap", self.stamps_ns)
+            raise DataError(f"{self.source}: {n} poses; at least two are needed, record again")
+        check_stamps(self.source, self.stamps_ns)
         self._check_span()
         try:
             object.__setattr__(self, "T", checked_array("T", self.T, (n, 4, 4), np.float64))
         except ValueError as error:
-            raise DataError(f"mocap: {error}; remove the samples where the body was not seen") from None
+            raise DataError(
+                f"{self.source}: {error}; remove the samples where the body was not seen"
+            ) from None
         R = self.T[:, :3, :3]
         bad = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max((1, 2)) > 1e-3
         bad |= np.linalg.det(R) < 0
         if bad.any():
-            raise DataError(f"mocap: pose {int(bad.argmax()) + 1} of {n} is not a rigid transform; remove it")
+            raise DataError(
+                f"{self.source}: pose {int(bad.argmax()) + 1} of {n} is not a rigid transform; remove it"
+            )
 
     def _check_span(self) -> None:
         """Raise DataError for stamps with an outlier or a clock step."""
@@ -49,8 +54,8 @@ class MocapTrajectory:
             return
         i = int(np.diff(t).argmax())
         raise DataError(
-            f"mocap: stamps jump by {(t[i + 1] - t[i]) * 1e-9:.0f} s at sample {i + 2}, from {t[i]} to "
-            f"{t[i + 1]} ns; cut there"
+            f"{self.source}: stamps jump by {(t[i + 1] - t[i]) * 1e-9:.0f} s at sample {i + 2}, from {t[i]} "
+            f"to {t[i + 1]} ns; cut there"
         )
 
     @cached_property
@@ -61,21 +66,21 @@ class MocapTrajectory:
     def between(self, start_ns: int, end_ns: int) -> MocapTrajectory:
         """Return the samples within [start_ns, end_ns]. Raises DataError if there are fewer than two."""
         keep = (self.stamps_ns >= start_ns) & (self.stamps_ns <= end_ns)
-        return MocapTrajectory(self.stamps_ns[keep], self.T[keep])
+        return replace(self, stamps_ns=self.stamps_ns[keep], T=self.T[keep])
 
     def thinned(self, min_spacing_ns: int) -> MocapTrajectory:
         """Return the first sample in every `min_spacing_ns`."""
         slot = (self.stamps_ns - self.stamps_ns[0]) // min_spacing_ns
         keep = np.diff(slot, prepend=-1) > 0
-        return self if keep.all() else MocapTrajectory(self.stamps_ns[keep], self.T[keep])
+        return self if keep.all() else replace(self, stamps_ns=self.stamps_ns[keep], T=self.T[keep])
 
     def rotated(self, R: F64) -> MocapTrajectory:
         """Return the poses in a world rotated by R (3, 3)."""
-        return MocapTrajectory(self.stamps_ns, se3.from_rt(R, np.zeros(3)) @ self.T)
+        return replace(self, T=se3.from_rt(R, np.zeros(3)) @ self.T)
 
     def shifted(self, offset_ns: int) -> MocapTrajectory:
         """Return the poses with `offset_ns` added to every stamp."""
-        return MocapTrajectory(self.stamps_ns + offset_ns, self.T)
+        return replace(self, stamps_ns=self.stamps_ns + offset_ns)
 
     def is_covered(self, stamps_ns: I64) -> np.ndarray:
         """Return (N,) bool: stamps between two neighbouring samples without a gap."""
