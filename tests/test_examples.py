@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.geometry.se3 import from_rt, inverse, quat_from_matrix, so3_exp
+from share.geometry.se3 import from_rt, inverse, matrix_from_quat, quat_from_matrix, so3_exp
+from share.headset.prediction import predict_pose
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -111,24 +112,55 @@ def test_receivers_have_the_matrices(file, frame):
         (rows,) = re.findall(rf"(?i)\b{name} = ([\[{{].+[\]}}]);", text)
         assert json.loads(rows.replace("{", "[").replace("}", "]")) == CONVENTIONS[frame][name]
         assert np.array_equal(np.linalg.inv(CONVENTIONS[frame]["body"]), CONVENTIONS[frame]["body"])
-    assert re.search(r"schema (!=|===) 3\b", text)
+    assert re.search(r"schema (!==?|===) 3\b", text)
 
 
-def test_the_web_receiver_computes_the_matrix(tmp_path, rng):
+def run_receiver(tmp_path, names: str, expression: str):
+    """Return what an expression of the web receiver's exported names is."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed: the JavaScript is not run")
-    T = from_rt(so3_exp(rng.normal(size=3)), rng.normal(size=3))
-    position, quaternion = T[:3, 3].tolist(), quat_from_matrix(T[:3, :3]).tolist()
-    module = tmp_path / "poses.mjs"
-    module.write_text((EXAMPLES / "webxr/share-poses.js").read_text())
+    (tmp_path / "poses.mjs").write_text((EXAMPLES / "webxr/share-poses.js").read_text())
     program = tmp_path / "run.mjs"
     program.write_text(
-        'import { toMatrix } from "./poses.mjs";\n'
-        f"console.log(JSON.stringify(toMatrix({position}, {quaternion})));\n"
+        f'import {{ {names} }} from "./poses.mjs";\nconsole.log(JSON.stringify({expression}));\n'
     )
     done = subprocess.run([node, program], capture_output=True, text=True, timeout=30, check=True)
+    return json.loads(done.stdout)
+
+
+def test_the_web_receiver_computes_the_matrix(tmp_path, rng):
+    T = from_rt(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    position, quaternion = T[:3, 3].tolist(), quat_from_matrix(T[:3, :3]).tolist()
+    found = run_receiver(tmp_path, "toMatrix", f"toMatrix({position}, {quaternion})")
     world, body = (np.eye(4), np.eye(4))
     world[:3, :3], body[:3, :3] = CONVENTIONS["webxr"]["world"], CONVENTIONS["webxr"]["body"]
     expected = world @ T @ inverse(body)
-    assert np.allclose(np.reshape(json.loads(done.stdout), (4, 4), order="F"), expected, atol=1e-12)
+    assert np.allclose(np.reshape(found, (4, 4), order="F"), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("frame", "ahead_ms"), [("odom", 20), ("map", 50), ("map", 400), ("map", -5), ("odom", 0)]
+)
+def test_the_web_receiver_predicts_as_the_reference_does(tmp_path, rng, frame, ahead_ms):
+    """Velocity comes along the axes of odom, whichever frame is asked for."""
+    T = {name: from_rt(so3_exp(rng.normal(size=3)), rng.normal(size=3)) for name in ("odom", "map")}
+    velocity, turning = rng.normal(size=3), 2 * rng.normal(size=3)
+    message = {
+        name: {"position": t[:3, 3].tolist(), "quaternion": quat_from_matrix(t[:3, :3]).tolist()}
+        for name, t in T.items()
+    }
+    message["odom"] |= {"velocity": velocity.tolist(), "angular_velocity": turning.tolist()}
+    found = run_receiver(
+        tmp_path, "predictPose", f"predictPose({json.dumps(message)}, {frame!r}, {ahead_ms})"
+    )
+    along = T[frame][:3, :3] @ T["odom"][:3, :3].T @ velocity
+    expected = predict_pose(T[frame], along, turning, ahead_ms / 1000)
+    assert np.allclose(found["position"], expected[:3, 3], atol=1e-12)
+    assert np.allclose(matrix_from_quat(np.array(found["quaternion"])), expected[:3, :3], atol=1e-12)
+
+
+def test_without_an_imu_the_web_receiver_keeps_the_pose(tmp_path):
+    pose = {"position": [1, 2, 3], "quaternion": [0, 0, 0, 1]}
+    found = run_receiver(tmp_path, "predictPose", f"predictPose({json.dumps({'odom': pose})}, 'odom', 50)")
+    assert found == pose

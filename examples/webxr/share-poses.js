@@ -5,13 +5,16 @@
 //     import { SharePoses } from "./share-poses.js";
 //     const poses = new SharePoses("ws://127.0.0.1:5571");
 //     function render() {                       // each animation frame
-//         const matrix = poses.matrix();        // of the device in the shared map; null while it is unknown
+//         const matrix = poses.matrix(12);      // of the device in the shared map, 12 ms from now, when the frame
+//                                               // is shown; null while it is unknown
 //         if (matrix) device.matrix.fromArray(matrix);   // three.js; device.matrixAutoUpdate = false
 //     }
 
 // examples/conventions.json, "webxr": a test holds these against it. Rows.
 const WORLD = [[0, -1, 0], [0, 0, 1], [-1, 0, 0]];
 const BODY = [[1, 0, 0], [0, -1, 0], [0, 0, -1]];
+
+const MAX_AHEAD_MS = 100;  // beyond, a head has turned otherwise
 
 export class SharePoses {
     // frame: "map", which all agents of a map_id share, or "odom", which never jumps within a segment.
@@ -26,7 +29,9 @@ export class SharePoses {
         this.socket = new WebSocket(this.url);
         this.socket.onmessage = (event) => {
             const message = JSON.parse(event.data);
-            if (message.schema === 3) this.message = message;
+            if (message.schema !== 3) return;
+            this.message = message;
+            this.arrivedMs = performance.now();
         };
         this.socket.onclose = () => {
             this.message = null;
@@ -39,10 +44,27 @@ export class SharePoses {
         this.socket.close();
     }
 
-    matrix() {
-        const pose = this.message && this.message[this.frame];
-        return pose ? toMatrix(pose.position, pose.quaternion) : null;
+    // Where the device will be in `inMs`: carried on from its newest pose at constant velocity and turning rate.
+    matrix(inMs = 0) {
+        const message = this.message;
+        if (!message || !message[this.frame]) return null;
+        const pose = predictPose(message, this.frame, message.age_ms + performance.now() - this.arrivedMs + inMs);
+        return toMatrix(pose.position, pose.quaternion);
     }
+}
+
+// The pose of a message in `frame`, `aheadMs` later than its stamp. Velocity comes along the axes of odom.
+export function predictPose(message, frame, aheadMs) {
+    const { position, quaternion } = message[frame];
+    const { velocity, angular_velocity: turning, quaternion: inOdom } = message.odom;
+    if (!velocity) return { position, quaternion };
+    const seconds = Math.min(Math.max(aheadMs, 0), MAX_AHEAD_MS) / 1000;
+    const [x, y, z, w] = inOdom;
+    const along = rotate(quaternion, rotate([-x, -y, -z, w], velocity));
+    return {
+        position: position.map((value, i) => value + along[i] * seconds),
+        quaternion: product(quaternion, fromRotation(turning.map((rate) => rate * seconds))),
+    };
 }
 
 // 16 numbers, column by column as WebGL has them: WORLD T BODY^-1; BODY is its own inverse.
@@ -54,6 +76,22 @@ export function toMatrix(position, quaternion) {
 
 function multiply(m, v) {
     return m.map((row) => row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
+}
+
+// Hamilton's product, x y z w
+function product([ax, ay, az, aw], [bx, by, bz, bw]) {
+    return [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ];
+}
+
+function fromRotation(vector) {
+    const angle = Math.hypot(...vector);
+    const scale = angle < 1e-9 ? 0.5 : Math.sin(angle / 2) / angle;
+    return [...vector.map((value) => value * scale), Math.cos(angle / 2)];
 }
 
 // v + 2 w (u x v) + 2 u x (u x v), with the quaternion (u, w)

@@ -1,8 +1,8 @@
 """Where a headset's own space is in the shared map: T_map_local from pairs of poses of one head.
 
 A Kalman filter over pairs at one moment: the device's pose in the map, through the mount, and the viewer's
-pose in the headset's space. Both drift, so the alignment does: a random walk at the wearer, where it is seen; a
-walk at either origin would be exaggerated by the lever arm.
+pose in the headset's space. Both drift, so the alignment does: a random walk at the wearer, where it is seen;
+the lever arm would exaggerate a walk at either origin.
 """
 
 from __future__ import annotations
