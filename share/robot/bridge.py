@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 from share.errors import printable
+from share.protocol.common_events import PrintLine, Tick
 from share.robot import robot_events as ev
 from share.robot.goal_control import ActiveGoal, GoalControl
 from share.robot.map_odom import MapMoved, MapOdom
@@ -73,7 +74,7 @@ class RobotBridge:
                 self._goals.take_answer(event, now_ns)
             case ev.ResultReceived():
                 self._effects += self._goals.take_result(event)
-            case ev.BridgeTick():
+            case Tick():
                 pass
         self._check_place()
         self._effects += self._goals.tick(now_ns)
@@ -280,4 +281,4 @@ class RobotBridge:
 
     def _print(self, text: str) -> None:
         if (line := self._line_limiter.admit(text, self._now_ns)) is not None:
-            self._effects.append(ev.BridgeLine(line))
+            self._effects.append(PrintLine(line))

@@ -24,6 +24,7 @@ from share.errors import StoreError
 from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
 from share.protocol.agent_health import trouble_lines
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
     AddKeyframe,
@@ -32,7 +33,6 @@ from share.protocol.edge_events import (
     DropRun,
     EdgeEffect,
     EdgeEvent,
-    EdgeTick,
     MapperResult,
     PeerMessageReceived,
     SaveChanges,
@@ -273,7 +273,7 @@ class EdgeRun:
         for line in self._link.refusals():
             self._count_refusal(line)
         self._handle_answers()
-        self._handle(EdgeTick())
+        self._handle(Tick())
         if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
             self._restart_mapping(self._restart_reason)
         if time.monotonic() >= self._report_due_s:

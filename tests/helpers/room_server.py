@@ -13,6 +13,7 @@ from share.config import Config
 from share.mapping.corrections import MapEvent
 from share.net.transport import bind
 from share.protocol import edge_events as ed
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
 from share.types import Correction
 from share.wire.codec import encode
@@ -47,7 +48,7 @@ class RoomServer:
         while not self._is_ended:
             if (message := self.link.receive(20)) is not None:
                 self._handle(ed.PeerMessageReceived(message.peer, message.frames, permissions=self._allowed))
-            self._handle(ed.EdgeTick())
+            self._handle(Tick())
 
     def _handle(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, time.monotonic_ns()):

@@ -23,6 +23,7 @@ from share.lab.robot.breakable import BreakableRoom
 from share.lab.robot.navigator import CONTROL_S, STOP, CmdVel, Navigator
 from share.lab.robot.planner import Costmap, RoomGrid
 from share.protocol import agent_events as aev
+from share.protocol.common_events import PrintLine, Tick
 from share.robot import robot_events as ev
 from share.robot.bridge import RobotBridge
 from share.robot.planar import PlanarPose, flattened
@@ -219,7 +220,7 @@ class RobotLoop(BreakableRoom):
             case aev.StatusReport() if effect.is_stale and effect.stamp_ns is not None:
                 status = effect.status
                 self._send_message(self._messages.of_state(effect.stamp_ns, status.state, status.pose_age_ms))
-            case aev.PrintLine():
+            case PrintLine():
                 self.note(f"agent: {effect.text}")
 
     @property
@@ -247,7 +248,7 @@ class RobotLoop(BreakableRoom):
             self.on_report(ev.GoalReport(goal["commander"], "the bridge has ended", is_final=True))
 
     def _bridge_tick(self) -> None:
-        self.to_bridge(ev.BridgeTick())
+        self.to_bridge(Tick())
         self._schedule(_TICK_NS, self._bridge_tick)
 
     def to_bridge(self, event: ev.RobotEvent) -> None:
@@ -277,7 +278,7 @@ class RobotLoop(BreakableRoom):
                 if not effect.text.endswith("to go"):
                     self.note(f"{effect.commander}: {effect.text}")
                 self.on_report(effect)
-            case ev.BridgeLine():
+            case PrintLine():
                 self.note(effect.text)
 
     @property
