@@ -9,10 +9,9 @@ from helpers.robot_drive import SECOND, UNIX_NS, RobotDrive, solid
 from share.geometry.se3 import from_rt, so3_exp
 from share.protocol.common_events import PrintLine
 from share.robot import robot_events as ev
-from share.robot.area import DrivingArea
 from share.robot.bridge import LEAD_S
 from share.robot.planar import PlanarPose, flattened
-from share.robot.settings import RobotSettings
+from share.robot.settings import DrivingArea, RobotSettings
 from share.types import TrackState
 
 
