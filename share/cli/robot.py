@@ -207,7 +207,7 @@ def cancel(**robot_options: Any) -> None:
     """
     *_, last = (_BRIDGE_ENDED, *_reach(**robot_options).cancel())
     if not last.is_reached:
-        raise ShareError(f"the robot was not told to stop: {last.text}")
+        raise ShareError(f"the robot was not stopped: {last.text}")
     click.echo(last.text)
 
 

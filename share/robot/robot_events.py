@@ -197,8 +197,7 @@ class LimitSpeed:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """What a commander is told of its goal `goal_id`. is_final: nothing follows. is_reached: it ended
-    there."""
+    """A report to a commander on `goal_id`. is_final: nothing follows. is_reached: the goal ended there."""
 
     commander: str
     text: str

@@ -71,7 +71,7 @@ class RobotLoop(BreakableRoom):
     """The robot, its navigation, its bridge, and the room's agents and edge.
 
     agent: the robot's; None where `own_pose` says where it is instead, T_map_base at each of frame_times_ns.
-    on_report, on_trace: called with what a commander is told, and ten times a second.
+    on_report, on_trace: called with each report to a commander, and ten times a second.
     trace: time s, true place, place by the map or None, map. lines: time s, text. newest_poses: of each
     agent.
     """
