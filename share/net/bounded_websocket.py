@@ -68,6 +68,10 @@ class PeerConnections:
     def open_count(self) -> int:
         return len(self._open)
 
+    @property
+    def waiting_count(self) -> int:
+        return len(self._waiting)
+
     def arrive(self, connection: BoundedConnection) -> None:
         if len(self._waiting) >= self.limits.max_waiting:
             oldest = next(iter(self._waiting))

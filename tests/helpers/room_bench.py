@@ -91,6 +91,9 @@ class RoomBench:
     def agent(self, name: str, run_id: int) -> str:
         """A present agent; return its run's key."""
         self.deliver(peer_id(run_id), encode(hello_of(name, run_id)))
+        return self.run_key(name)
+
+    def run_key(self, name: str) -> str:
         return next(run.key for run in self.edge.room._runs.present() if run.name == name)
 
     def correct(self, run: str, map_id: str, T_map_odom: F64, keyframe: int = 0) -> None:
@@ -166,7 +169,7 @@ class RoomBench:
         end_ns = self.now_ns + round(seconds * 1e9)
         while self.now_ns < end_ns:
             self.now_ns += step_ms * MS
-            self._pass_on()
+            self.pass_on()
             self.to_edge(Tick())
             if self.tickets and not self.is_disk_slow:
                 self.to_edge(ed.ChangesSaved(self.tickets.pop()))
@@ -174,7 +177,7 @@ class RoomBench:
             for peer in self.clients:
                 self.to_client(peer, Tick())
 
-    def _pass_on(self) -> None:
+    def pass_on(self) -> None:
         for _ in range(20):  # answers of answers, in one step
             due = sorted((one for one in self.under_way if one[0] <= self.now_ns), key=lambda one: one[0])
             if not due:

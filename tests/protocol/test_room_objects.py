@@ -87,10 +87,8 @@ def test_loss_doubles_and_disorder_heal(seed: int) -> None:
         bench.run(0.06)
     bench.run(12)
     assert positions(bench, bench.ann) == last == positions(bench, bench.bob)
-    held = {
-        n: tuple(one.object.T_map_object[:3, 3]) for n, one in bench.edge.room._objects.objects._kept.items()
-    }
-    assert held == last
+    kept = [one.object for one in bench.edge.room.kept_objects()]
+    assert {one.object_id: tuple(one.T_map_object[:3, 3]) for one in kept} == last
     # a removal whose put was lost, and that took its place, finds nothing
     assert all(not one or one.startswith("there is no object") for one in answers(bench, bench.ann).values())
 
@@ -159,7 +157,7 @@ def test_a_removal_that_the_dead_edge_had_done_counts_as_done(bench) -> None:
     bench.put(bench.ann, 1, 7, at(1, 2), MAP)
     bench.run(0.1)
     bench.to_client(bench.ann, ev.MessageWanted(room.RemoveObject(2, 7)))
-    bench._pass_on()
+    bench.pass_on()
     bench.under_way.clear()  # the receipt is lost
     bench.restart_edge()
     bench.run(5)
@@ -239,15 +237,15 @@ def test_an_owner_and_the_room_have_their_limits(bench) -> None:
     for n in range(MAX_OWNED + 1):
         bench.said(bench.ann, room.PutObject(n, n, ObjectKind.CUBE, MAP, at(0, 0)))
         bench.now_ns += 10**8
-    assert len(bench.edge.room._objects.objects) == MAX_OWNED
+    assert len(bench.edge.room.kept_objects()) == MAX_OWNED
     for k in range(5):
         peer = bench.client(f"c{k}", 100 + k)
-        bench._pass_on()
+        bench.pass_on()
         for n in range(MAX_OWNED):
             bench.said(peer, room.PutObject(n, 100 * (k + 1) + n, ObjectKind.CUBE, MAP, at(0, 0)))
             bench.now_ns += 10**8
         bench.to_client(peer, ev.ClientEnded())
-    assert len(bench.edge.room._objects.objects) == MAX_OBJECTS
+    assert len(bench.edge.room.kept_objects()) == MAX_OBJECTS
 
 
 def test_too_many_requests_are_neither_taken_nor_answered_and_come_again(bench) -> None:
@@ -266,7 +264,7 @@ def test_too_many_requests_are_neither_taken_nor_answered_and_come_again(bench) 
 def two_maps() -> tuple[RoomBench, str, str]:
     """ann and bob, each in a map of its own, with an object each."""
     bench = prepared(RoomBench())
-    ann = next(run.key for run in bench.edge.room._runs.present())
+    ann = bench.run_key("ann")
     bob = bench.agent("bob", 2)
     bench.correct(bob, "bob-2/0", np.eye(4))
     bench.put(bench.ann, 1, 1, at(1, 0), MAP)
