@@ -106,7 +106,8 @@ def edge(
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
-        pages = _Pages(stack, stderr, http, view, token)  # before any process starts: the port may be in use
+        # before any process starts: the port may be in use
+        pages = _EdgePages(stack, stderr, http, view, token)
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         on_event = partial(_print_event, stderr, verbose)
         run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed)
@@ -121,7 +122,7 @@ def edge(
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-class _Pages:
+class _EdgePages:
     """The status page and the live room of an edge, as far as they are asked for. run: set once it is made.
 
     Raises UsageError for an address that is none, TransportError for a port in use."""

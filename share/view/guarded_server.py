@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Annotated, Any
@@ -44,23 +44,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
         async def check(connection: Any, request: Any) -> Any:
             while not is_built:  # viser serves before it is ready
                 await asyncio.sleep(0.01)
-            headers: dict[str, str] = {}
-            for name, value in request.headers.raw_items():
-                headers.setdefault(name.lower(), value)
-            refusal = guard.check(request.path, headers)
-            if refusal is not None:
-                response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
-            elif "upgrade" in headers and not connections.admit(connection):
-                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
-            elif (response := respond(connection, request)) is not None:
-                lines = guard.cookie_headers()
-            for line in lines if response is not None else ():
-                name, _, value = line.partition(": ")
-                response.headers[name] = value
-            if response is not None:
-                response.headers["X-Frame-Options"] = "DENY"
-                response.headers["Referrer-Policy"] = "no-referrer"
-            return response
+            return _answer(connection, request, guard, connections, respond)
 
         ours = {
             "process_request": check,
@@ -80,6 +64,36 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
         raise ShareError(
             "the live room does not know this version of viser; install the one that setup.cfg names"
         )
+
+
+def _answer(
+    connection: Any,
+    request: Any,
+    guard: HttpGuard,
+    connections: PeerConnections,
+    respond: Callable[[Any, Any], Any],
+) -> Any:
+    """Return the response to a request: a refusal, or what `respond` makes of it; None: it becomes a
+    WebSocket."""
+    headers: dict[str, str] = {}
+    for name, value in request.headers.raw_items():
+        headers.setdefault(name.lower(), value)
+    refusal = guard.check(request.path, headers)
+    lines: Sequence[str]
+    if refusal is not None:
+        response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
+    elif "upgrade" in headers and not connections.admit(connection):
+        response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
+    elif (response := respond(connection, request)) is not None:
+        lines = guard.cookie_headers()
+    else:
+        return None
+    for line in lines:
+        name, _, value = line.partition(": ")
+        response.headers[name] = value
+    response.headers["X-Frame-Options"] = "DENY"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    return response
 
 
 def remove_tunnel(viser_server: Any) -> None:
