@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 Colour = tuple[int, int, int]  # red, green, blue, 0 to 255
 
-# In order of appearance; told apart also by those who see few colours, on white and on black (after Okabe and
+# In order of appearance; distinct also to those who see few colours, on white and on black (after Okabe and
 # Ito, *Color Universal Design*, 2008).
 AGENT_COLOURS: tuple[Colour, ...] = (
     *((58, 151, 212), (230, 159, 0), (0, 158, 115), (199, 181, 0)),

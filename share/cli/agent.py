@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import camera_options, options
+from share.cli import camera_options, options, room_options
 from share.cli.terminal import LiveLine
 from share.errors import ShareError, UsageError
 
@@ -37,11 +37,7 @@ if TYPE_CHECKING:
 )
 @click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Address of the edge.")
 @options.keys
-@click.option(
-    "--server-key",
-    metavar="FILE|KEY",
-    help="Public key of the edge; required for an edge on another machine. Turns on encryption.",
-)
+@room_options.server_key
 @click.option(
     "--link",
     metavar="NAME|FILE",
@@ -120,8 +116,9 @@ def agent(
         raise UsageError("--true-error does not go with --streamed, where the edge tracks; leave out one")
     agent_kind = _agent_kind(kind, camera.profile_name)
     run_id = secrets.randbits(63)
-    connect_edge = _connector(address, run_id, _agent_keys(keys, server_key))
-    connect_link = connect_edge if link is None else _emulated_link(connect_edge, link, link_seed)
+    connect_link = _connector(address, run_id, room_options.read_keys(keys, server_key))
+    if link is not None:
+        connect_link = _emulated_link(connect_link, link, link_seed)
     live_line = _AgentLine(streamed)
     opened = camera_options.open_source(source, calib, frames, camera, live_line.print_line)
     live_line.watch_source(opened)
@@ -129,18 +126,8 @@ def agent(
     hello = Hello(options.agent_name(name), agent_kind, run_id, opened.rig, streamed)
     errors = None if streamed else _error_estimator(opened, settings, true_error, live_line.print_line)
     sinks = open_pose_sinks(poses, hello.name, origins, live_line.print_line)
-    run = AgentRun(
-        opened,
-        hello,
-        settings,
-        connect_link,
-        out,
-        live_line.print_line,
-        live_line.show,
-        verbose,
-        errors,
-        sinks,
-    )
+    shown = live_line.print_line, live_line.show, verbose
+    run = AgentRun(opened, hello, settings, connect_link, out, *shown, errors, sinks)
     with stop_on_signal(run.stop):
         run.run()
     live_line.end()
@@ -149,24 +136,16 @@ def agent(
     if (warning := unacknowledged_text(run, hello.name, settings.agent.finish_s)) is not None:
         live_line.print_line(warning)
         live_line.end()
-    if not run.report["protocol"]["edge_sessions"]:
-        if (refusal := run.report["protocol"]["refusal"]) is not None:
-            raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")
-        raise ShareError(f"no edge answered at {address}; {run.trouble or _NO_EDGE_HINT}")
+    _check_answered(run, hello.name, address)
 
 
-_NO_EDGE_HINT = "is `share edge` running there?"
-
-
-def _agent_keys(folder: Path | None, server_key: str | None) -> AgentKeys | None:
-    """Return the keys of this machine and the edge, None without --server-key. Raises UsageError."""
-    from share.net.keys import agent_keys
-
-    if server_key is None:
-        if folder is not None:
-            raise UsageError("--keys needs --server-key, the public key of the edge")
-        return None
-    return agent_keys(folder, server_key)
+def _check_answered(run: AgentRun, name: str, address: str) -> None:
+    """Raise ShareError if no edge has served the run."""
+    if run.report["protocol"]["edge_sessions"]:
+        return
+    if (refusal := run.report["protocol"]["refusal"]) is not None:
+        raise ShareError(f"the edge at {address} refuses '{name}': {refusal}")
+    raise ShareError(f"no edge answered at {address}; {run.trouble or 'is `share edge` running there?'}")
 
 
 def _agent_kind(kind_given: str | None, profile_name: str | None) -> AgentKind:

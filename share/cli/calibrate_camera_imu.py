@@ -70,11 +70,9 @@ def camera_imu(
                 --imu calib/mine --out calib/mine
     """
     from share.files.writing import atomic_write, writable_dir
-    from share.files.yaml_file import read_yaml_text
     from share.lab.calibrate import camera_imu_report as report
     from share.lab.calibrate.board_views import open_rig_images
-    from share.lab.calibrate.camera_report import has_noise
-    from share.lab.calibrate.imu_table import chain_file, stated_noise
+    from share.lab.calibrate.imu_table import stated_noise
     from share.lab.calibrate.report import failure_message, output_paths, to_json
     from share.recordings.calibration import CAMCHAIN, IMU_CHAIN
 
@@ -90,15 +88,7 @@ def camera_imu(
     )
     imu_chain = out / IMU_CHAIN
     atomic_write(chain, report.camchain_yaml(outcome, source, report_file.name))
-    warnings = _warnings(outcome)
-    if not imu_chain.exists():
-        as_given = None if imu is None else read_yaml_text(chain_file(imu, "--imu"))
-        atomic_write(imu_chain, as_given or report.imu_chain_yaml(outcome, source))
-    elif not has_noise(imu_chain, noise):
-        used = "the recording's" if imu is None else f"that of --imu {imu}"
-        warnings.append(
-            f"{imu_chain} has other noise than was used ({used}) and is kept; to use it, give --imu {out}"
-        )
+    warnings = [*_warnings(outcome), *_write_imu_chain(imu_chain, imu, source, noise, outcome)]
     atomic_write(report_file, text + "\n")
     report.draw_residuals(picture, outcome.fit, f"{source}: {verdict}")
     click.echo(text if as_json else _summary(outcome, (chain, imu_chain, report_file, picture)))
@@ -106,6 +96,27 @@ def camera_imu(
         print_note(source, warning)
     if not outcome.verdict.passed:
         raise ShareError(f"{source}: {failure_message(chain, outcome.verdict.reasons)}")
+
+
+def _write_imu_chain(
+    path: Path, imu: str | None, source: str, noise: ImuNoise, outcome: CameraImuCalibration
+) -> list[str]:
+    """Write the noise that was used, unless there is an IMU chain; return a warning if that has another."""
+    from share.files.writing import atomic_write
+    from share.files.yaml_file import read_yaml_text
+    from share.lab.calibrate.camera_imu_report import imu_chain_yaml
+    from share.lab.calibrate.camera_report import has_noise
+    from share.lab.calibrate.imu_table import chain_file
+
+    if not path.exists():
+        as_given = None if imu is None else read_yaml_text(chain_file(imu, "--imu"))
+        atomic_write(path, as_given or imu_chain_yaml(outcome, source))
+    elif not has_noise(path, noise):
+        used = "the recording's" if imu is None else f"that of --imu {imu}"
+        return [
+            f"{path} has other noise than was used ({used}) and is kept; to use it, give --imu {path.parent}"
+        ]
+    return []
 
 
 def _calibrate(

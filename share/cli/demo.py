@@ -80,19 +80,12 @@ def demo(
     """
     config = options.load_config(config_file, [policy])  # checked before the room is made
     policy = config.edge.policy
-    if is_compared and policy in (BASE_POLICY, STREAMED):
-        raise UsageError(f"--compare plays {BASE_POLICY} and another policy; choose another than {policy}")
-    if policy == STREAMED and true_error:
-        raise UsageError(
-            "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
-        )
-    from share.devices.host import core_count
+    _check_policy(policy, is_compared, true_error)
     from share.files.writing import writable_dir
     from share.lab.emulate.recipe import DEMO_AGENTS, demo_recipe, meeting_seed
     from share.lab.emulate.session import make_cached_session
     from share.lab.evaluate.emulated_network import LinkAssignment
-    from share.lab.evaluate.real_time import RunOptions, play_in_real_time
-    from share.lab.evaluate.scoring import join_times, score_session
+    from share.lab.evaluate.real_time import RunOptions
     from share.recordings.session import read_session
 
     LinkAssignment.parse(link).check(DEMO_AGENTS)
@@ -101,28 +94,39 @@ def demo(
     seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
         session = read_session(make_cached_session(demo_recipe(room, seconds, seed), progress=stages))
+    terms = RunOptions(policy, link, seed, true_error, agents_first=True)
     if is_compared:
-        terms = RunOptions(policy, link, seed, true_error, agents_first=True)
         _compare(session, terms, config, out, as_json)
-        return
+    else:
+        named = replace(terms, config=None if config_file is None else str(config_file))
+        _play(session, seconds, named, view, out, as_json)
+
+
+def _check_policy(policy: str, is_compared: bool, true_error: bool) -> None:
+    if is_compared and policy in (BASE_POLICY, STREAMED):
+        raise UsageError(f"--compare plays {BASE_POLICY} and another policy; choose another than {policy}")
+    if policy == STREAMED and true_error:
+        raise UsageError(
+            "--true-error does not go with --policy streamed, where the edge tracks; leave out one"
+        )
+
+
+def _play(session: Session, seconds: float, terms: RunOptions, view: bool, out: Path, as_json: bool) -> None:
+    """Play a session in real time; show how accurately the agents knew their poses."""
+    from share.devices.host import core_count
+    from share.lab.evaluate.real_time import play_in_real_time
+    from share.lab.evaluate.scoring import join_times, score_session
+
     screen = RunScreen(view)
-    run_terms = RunOptions(
-        policy,
-        link,
-        seed,
-        true_error,
-        config=None if config_file is None else str(config_file),
-        agents_first=True,
-    )
-    folders = play_in_real_time(session, seconds, run_terms, out, screen.show, screen.pages)
+    folders = play_in_real_time(session, seconds, terms, out, screen.show, screen.pages)
     screen.end()
     result = score_session(session, folders)
     since_s = join_times(out / "edge" / "events.jsonl")
     picture = _draw_paths(out, result)
     if as_json:
-        click.echo(json.dumps(_document(policy, result, since_s)))
+        click.echo(json.dumps(_document(terms.policy, result, since_s)))
         return
-    click.echo(_score_table(result, since_s, policy == STREAMED))
+    click.echo(_score_table(result, since_s, terms.policy == STREAMED))
     if core_count() <= len(folders):
         warning = (
             f"{len(folders)} agents and the edge shared {core_count()} cores, so frames waited; on separate "

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,35 +79,19 @@ def doctor(
     if mode is not None and not acceptance:
         raise UsageError("--mode is for --acceptance; give both, or leave it out")
     from share.devices.checks import failures
-    from share.runtime.doctor import (
-        inspect_calibration,
-        inspect_camera,
-        inspect_edge,
-        inspect_host,
-        inspect_port,
-        query_sdk,
-    )
+    from share.runtime.doctor import inspect_device, inspect_edge
     from share.sensors.profile import load_host_profile
 
     host = load_host_profile(profile)
-    sdk = query_sdk(host)
-    findings = [
-        *inspect_camera(host, sdk),
-        *inspect_calibration(host, calib, sdk),
-        *inspect_host(host, out),
-        *inspect_port(host),
-        *inspect_edge(host, address, keys, server_key),
-    ]
+    inspect_link = partial(inspect_edge, host, address, keys, server_key)
+    findings = [*inspect_device(host, calib, out), *inspect_link()]
     if acceptance:
         if host.sensor is None:
             raise UsageError(f"--acceptance needs a camera; profile '{host.name}' has none")
         run = _Acceptance(profile, mode, calib, minutes, out)
         findings += run.play()
         if address is not None:
-            findings += [
-                replace(one, name=f"{one.name}, afterwards")
-                for one in inspect_edge(host, address, keys, server_key)[1:]
-            ]
+            findings += [replace(one, name=f"{one.name}, afterwards") for one in inspect_link()[1:]]
         run.write(host.name, findings)
     failed = failures(findings)
     click.echo(json.dumps(_report(host.name, findings)) if as_json else _findings_text(findings))

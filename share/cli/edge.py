@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +15,12 @@ from share.errors import UsageError
 from share.event_kinds import EventKind
 
 if TYPE_CHECKING:
+    from contextlib import ExitStack
+
     from share.cli.stderr import Stderr
     from share.net.keys import EdgeKeys
     from share.runtime.edge import EdgeRun
+    from share.runtime.edge_observer import EdgeObserver
     from share.store.map_store import MapStore
     from share.view.viewer import LiveRoom
 
@@ -80,7 +84,6 @@ def edge(
     """
     settings = options.load_config(config_file, [policy])
     from contextlib import ExitStack, closing
-    from functools import partial
 
     from share.cli.stderr import Stderr
     from share.net.http_guard import read_token
@@ -88,10 +91,7 @@ def edge(
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
-    from share.runtime.plan import Plan
     from share.runtime.signals import stop_on_signal
-    from share.runtime.status_server import StatusServer
-    from share.view.viewer import LiveRoom
     from share.wire.layouts import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     edge_key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
@@ -102,59 +102,65 @@ def edge(
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
     if http_token is not None and http is None and view is None:
         raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
-    password = "" if http_token is None else f"  (any name; the password is in {http_token})"
     token = None if http_token is None else read_token(http_token)
-    runs: list[EdgeRun] = []
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
-        status, rooms, plans = None, list[LiveRoom](), list[Plan]()
-        if http is not None:  # before any process starts: the port may be in use
-            plans.append(Plan())
-            shown = partial(_shown_report, runs, rooms)
-            server = StatusServer(http, shown, stderr.print_line, token, plans[0].report)
-            status = stack.enter_context(closing(server))
-        if view is not None:
-            rooms.append(stack.enter_context(closing(_open_room(view, token, stderr))))
+        # before any process starts: the port may be in use
+        pages = _EdgePages(stack, stderr, http, view, token)
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
-        run = stack.enter_context(
-            closing(
-                EdgeRun(
-                    settings,
-                    link,
-                    out,
-                    lambda e: _print_event(stderr, e, verbose),
-                    store,
-                    [*plans, *(room.feed for room in rooms)],
-                    allowed,
-                )
-            )
-        )
-        runs.append(run)
+        on_event = partial(_print_event, stderr, verbose)
+        run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed)
+        pages.run = stack.enter_context(closing(run))
         with stop_on_signal(run.stop):
             stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}")
             _print_keys(stderr, edge_key_pair)
             if allowed:
                 stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")
-            if status is not None:
-                stderr.print_line(f"status at http://{status.endpoint}/{password}")
-            for room in rooms:
-                stderr.print_line(f"live room at http://{room.endpoint}/{password}")
+            pages.print_addresses(http_token)
             report = run.run()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-def _open_room(address: str, token: str | None, stderr: Stderr) -> LiveRoom:
-    """Start the live room. Raises UsageError, TransportError."""
-    from share.view.viewer import LiveRoom
+class _EdgePages:
+    """The status page and the live room of an edge, as far as they are asked for. run: set once it is made.
 
-    return LiveRoom(address, token, "SHARE edge", stderr.print_line)
+    Raises UsageError for an address that is none, TransportError for a port in use."""
 
+    def __init__(
+        self, stack: ExitStack, stderr: Stderr, http: str | None, view: str | None, token: str | None
+    ) -> None:
+        from share.runtime.plan import Plan
+        from share.runtime.status_server import StatusServer
+        from share.view.viewer import LiveRoom
 
-def _shown_report(runs: list[EdgeRun], rooms: list[LiveRoom]) -> dict[str, Any]:
-    """Return the report of the edge, if it runs yet, with the address of a live room that lives."""
-    report = runs[0].report() if runs else {}
-    return report | {"live_room": rooms[0].endpoint} if rooms and rooms[0].is_alive else report
+        self.run: EdgeRun | None = None
+        self.observers: list[EdgeObserver] = []
+        self._stderr, self._addresses = stderr, list[str]()
+        self._room: LiveRoom | None = None
+        if http is not None:
+            plan = Plan()
+            status = StatusServer(http, self._report, stderr.print_line, token, plan.report)
+            stack.callback(status.close)
+            self.observers.append(plan)
+            self._addresses.append(f"status at http://{status.endpoint}/")
+        if view is not None:
+            self._room = LiveRoom(view, token, "SHARE edge", stderr.print_line)
+            stack.callback(self._room.close)
+            self.observers.append(self._room.feed)
+            self._addresses.append(f"live room at http://{self._room.endpoint}/")
+
+    def _report(self) -> dict[str, Any]:
+        """Return the report of the edge, if it runs yet, with the address of a live room that lives."""
+        report = {} if self.run is None else self.run.report()
+        if self._room is None or not self._room.is_alive:
+            return report
+        return report | {"live_room": self._room.endpoint}
+
+    def print_addresses(self, token_file: Path | None) -> None:
+        password = "" if token_file is None else f"  (any name; the password is in {token_file})"
+        for one in self._addresses:
+            self._stderr.print_line(one + password)
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:
@@ -209,7 +215,7 @@ _SHOWN_EVENTS: set[EventKind] = {  # without -v
 }
 
 
-def _print_event(stderr: Stderr, event: dict[str, Any], verbose: bool) -> None:
+def _print_event(stderr: Stderr, verbose: bool, event: dict[str, Any]) -> None:
     if verbose or event["event"] in _SHOWN_EVENTS:
         agent = f" {event['agent']}:" if event["agent"] else ""
         stderr.print_line(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}")

@@ -71,12 +71,12 @@ def put(
     import secrets
 
     from share.library.room import placed
-    from share.protocol.room_events import RequestWanted
+    from share.protocol.room_events import MessageWanted
 
     chosen = secrets.randbelow(2**31) if object_id is None else object_id
     message = placed(secrets.randbits(40), chosen, kind, (x, y, z), math.radians(yaw), map_id)
     with closing(room_options.open_room(address, name, keys, server_key)) as room:
-        room.handle(RequestWanted(message))
+        room.handle(MessageWanted(message))
         room_options.answer(room, message.request)
     click.echo(json.dumps({"id": chosen}) if as_json else str(chosen))
 
@@ -93,12 +93,12 @@ def remove(object_id: int, address: str, name: str | None, keys: Path | None, se
     \b
     Example:  share marker remove 7 --edge tcp://127.0.0.1:5555 --name ann
     """
-    from share.protocol.room_events import RequestWanted
+    from share.protocol.room_events import MessageWanted
     from share.wire.room_messages import RemoveObject
 
     with closing(room_options.open_room(address, name, keys, server_key)) as room:
         message = RemoveObject(next(room.numbers), object_id)
-        room.handle(RequestWanted(message))
+        room.handle(MessageWanted(message))
         room_options.answer(room, message.request)
 
 

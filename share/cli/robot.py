@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from math import degrees, radians
+from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import click
 
 from share.cli import options, room_options
 from share.cli.commands import CommandGroup
+from share.cli.robot_links import GoalUpdate, LocalRobot, RobotAtEdge, RobotLink
 from share.cli.terminal import LiveLine
 from share.errors import ShareError, UsageError
 
@@ -31,6 +32,7 @@ _namespace = click.option(
 )
 
 
+_BRIDGE_ENDED = GoalUpdate("the bridge has ended", is_reached=False)  # what remains without an answer
 _over_wire = options.option_group(
     room_options.edge("Reach the robot over this edge.  [default: the bridge on this machine]"),
     room_options.name,
@@ -169,18 +171,7 @@ def _poses_address(text: str) -> HostPort:
 @_over_wire
 @options.as_json
 def goto(
-    x: float,
-    y: float,
-    yaw: float | None,
-    map_id: str | None,
-    domain: int,
-    namespace: str,
-    address: str | None,
-    name: str | None,
-    robot_name: str | None,
-    keys: Path | None,
-    server_key: str | None,
-    as_json: bool,
+    x: float, y: float, yaw: float | None, map_id: str | None, as_json: bool, **robot_options: Any
 ) -> None:
     """Send the robot to X Y, m in the map, and wait until it is there. Exit code 1 if it does not get there.
 
@@ -192,59 +183,32 @@ def goto(
     Example:  share robot goto 2.5 -0.8 90
               share robot goto 2.5 -0.8 --edge tcp://127.0.0.1:5555 --name ann
     """
-    from share.runtime.robot_commands import ask_bridge, command_path
-
-    turned = None if yaw is None else radians(yaw)
-    wish = {"do": "goto", "x": x, "y": y, "yaw": turned, "map_id": map_id}
-    live, last = LiveLine(), {"goal": "the bridge has ended", "is_reached": False}
-    answers = ask_bridge(command_path(domain, namespace), wish)
-    if address is not None:
-        from share.cli.robot_wire import goto_answers
-
-        room = room_options.open_room(address, name, keys, server_key)
-        answers = goto_answers(room, robot_name, x, y, turned, map_id)
-    for answer in answers:
-        last = answer
-        live.write(str(answer.get("goal")))
-        if answer.get("is_final") and address is None:  # over an edge the answers end, and close the link
-            break
+    live, last = LiveLine(), _BRIDGE_ENDED
+    for last in _reach(**robot_options).goto(x, y, None if yaw is None else radians(yaw), map_id):
+        live.write(last.text)
     live.end()
-    text, is_reached = str(last["goal"]), bool(last.get("is_reached"))
     if as_json:
-        click.echo(json.dumps({"reached": is_reached, "text": text}))
-    elif is_reached:
-        click.echo(text)
-    if not is_reached:
-        raise ShareError(f"the robot is not at x {x:g} y {y:g}: {text}")
+        click.echo(json.dumps({"reached": last.is_reached, "text": last.text}))
+    elif last.is_reached:
+        click.echo(last.text)
+    if not last.is_reached:
+        raise ShareError(f"the robot is not at x {x:g} y {y:g}: {last.text}")
 
 
 @robot.command(short_help="Stop the robot.")
 @_domain
 @_namespace
 @_over_wire
-def cancel(
-    domain: int,
-    namespace: str,
-    address: str | None,
-    name: str | None,
-    robot_name: str | None,
-    keys: Path | None,
-    server_key: str | None,
-) -> None:
+def cancel(**robot_options: Any) -> None:
     """Cancel the robot's goal, whoever gave it.
 
     \b
     Example:  share robot cancel
     """
-    from share.runtime.robot_commands import ask_bridge, command_path
-
-    if address is not None:
-        from share.cli.robot_wire import cancel_over_wire
-
-        click.echo(cancel_over_wire(room_options.open_room(address, name, keys, server_key), robot_name))
-        return
-    for answer in ask_bridge(command_path(domain, namespace), {"do": "cancel"}):
-        click.echo(answer.get("goal"))
+    *_, last = (_BRIDGE_ENDED, *_reach(**robot_options).cancel())
+    if not last.is_reached:
+        raise ShareError(f"the robot was not stopped: {last.text}")
+    click.echo(last.text)
 
 
 @robot.command(short_help="Show where the robot is and what it does.")
@@ -252,7 +216,27 @@ def cancel(
 @_namespace
 @_over_wire
 @options.as_json
-def watch(
+def watch(as_json: bool, **robot_options: Any) -> None:
+    """Show where the robot is and what it does, twice a second, until Ctrl-C. With --json, a line of JSON
+    each time.
+
+    \b
+    Example:  share robot watch
+    """
+    live = LiveLine()
+    try:
+        for one in _reach(**robot_options, wants_robots=True).watch():
+            if as_json:
+                click.echo(json.dumps(one.fields))
+            elif one.text is not None:
+                show = live.write if one.is_place and live.is_terminal else live.print_line
+                show(one.text)
+    finally:
+        live.end()
+
+
+def _reach(
+    *,
     domain: int,
     namespace: str,
     address: str | None,
@@ -260,42 +244,12 @@ def watch(
     robot_name: str | None,
     keys: Path | None,
     server_key: str | None,
-    as_json: bool,
-) -> None:
-    """Show where the robot is and what it does, twice a second, until Ctrl-C. With --json, a line of JSON
-    each time.
+    wants_robots: bool = False,
+) -> RobotLink:
+    """Return the way to the robot: over an edge with --edge, else by the bridge on this machine."""
+    from share.runtime.robot_commands import command_path
 
-    \b
-    Example:  share robot watch
-    """
-    from share.runtime.robot_commands import ask_bridge, command_path
-
-    if address is not None:
-        from share.cli.robot_wire import watch_over_wire
-
-        wants = {"wants_robots": True}
-        watch_over_wire(room_options.open_room(address, name, keys, server_key, **wants), robot_name, as_json)
-        return
-    live = LiveLine()
-    for answer in ask_bridge(command_path(domain, namespace), {"do": "watch"}):
-        if as_json:
-            click.echo(json.dumps(answer))
-        elif "state" not in answer:
-            live.print_line(str(answer.get("line") or f"{answer.get('commander')}: {answer.get('goal')}"))
-        elif live.is_terminal:
-            live.write(_state_text(answer["state"]))
-        else:
-            live.print_line(_state_text(answer["state"]))
-    live.end()
-    raise ShareError("the bridge has ended")
-
-
-def _state_text(state: dict[str, Any]) -> str:
-    if state["pose"] is None:
-        return f"no place: {state['fault']}"
-    x, y, yaw = state["pose"]
-    where = f"x {x:.2f} y {y:.2f} m, {degrees(yaw):.0f}° in {state['map_id']}"
-    goal = state["goal"]
-    if goal is not None:
-        return f"{where}; to x {goal['x']:.2f} y {goal['y']:.2f} m for {goal['commander']}: {goal['status']}"
-    return where if state["refusal"] is None else f"{where}; no goals: {state['refusal']}"
+    if address is None:
+        return LocalRobot(command_path(domain, namespace))
+    room = room_options.open_room(address, name, keys, server_key, wants_robots=wants_robots)
+    return RobotAtEdge(room, robot_name)

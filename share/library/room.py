@@ -78,7 +78,7 @@ class RoomThread(BackgroundRun):
         self._changed = threading.Condition()  # guards all below, and the link's state machine
         self._answers: dict[int, str] = {}
         self._goals: dict[int, RobotGoal] = {}
-        self._inbox: list[ev.RequestWanted | ev.CommandWanted] = []
+        self._inbox: list[ev.MessageWanted] = []
         self._objects: dict[int, RoomObject] = {}
         self._error: ShareError | None = None
         self._has_all, self._is_ending = False, False
@@ -139,7 +139,7 @@ class RoomThread(BackgroundRun):
         self._ask(message, timeout_s)
 
     def _ask(self, message: PutObject | RemoveObject, timeout_s: float) -> None:
-        self._post(ev.RequestWanted(message))
+        self._post(ev.MessageWanted(message))
         if not self._wait(lambda: message.request in self._answers, timeout_s):
             raise ShareError(f"the edge did not answer for {timeout_s:g} s; it may still do as asked")
         if reason := self._answers.pop(message.request):
@@ -168,16 +168,16 @@ class RoomThread(BackgroundRun):
             self._goals[command] = goal
             if len(self._goals) > _MAX_GOALS:
                 del self._goals[next(iter(self._goals))]
-        self._post(ev.CommandWanted(message))
+        self._post(ev.MessageWanted(message))
         return goal
 
     def stop_robot(self, robot: str | None = None) -> None:
         """Stop a robot, whoever sent it. Returns at once."""
-        self._post(ev.CommandWanted(Cancel(next(self._link.numbers), robot)))
+        self._post(ev.MessageWanted(Cancel(next(self._link.numbers), robot)))
 
     # ------------------------------------------------------------ the thread
 
-    def _post(self, event: ev.RequestWanted | ev.CommandWanted) -> None:
+    def _post(self, event: ev.MessageWanted) -> None:
         with self._changed:
             self._inbox.append(event)
         self._link.wake()
@@ -225,7 +225,7 @@ class RoomThread(BackgroundRun):
     def _stop_robots(self) -> None:
         """Stop what is under way, and wait a moment for the answer; without one the robot stops by itself."""
         for robot in {goal._robot for goal in self._goals.values() if not goal.is_final}:
-            self._link.handle(ev.CommandWanted(Cancel(next(self._link.numbers), robot)))
+            self._link.handle(ev.MessageWanted(Cancel(next(self._link.numbers), robot)))
         end_s = time.monotonic() + 1.0
         while not self._link.client.is_idle and time.monotonic() < end_s:
             self._step()

@@ -15,11 +15,15 @@ that of a map that has changed:
     localisation_gate    is an agent's place known well enough to publish a correction?
     corrections          which agents get one
 
-`atlas.Atlas` holds all of it. Redundant keyframes go by `culling` and `keyframe_removal`.
+`atlas.Atlas` holds all of it, each keyframe's pose in `pose_table`. Slow work is yielded as `steps`, which
+the caller runs; what is decided and stored goes into `mapper_log`, as `map_changes`. Keyframes leave by
+`culling` (`redundancy`), `forgetting`, and `map_renewal` (`missing_points`); `keyframe_removal` mends the
+graph.
 
 To change:
 
-    the descriptor       `share.vision.orb`, `share.vision.matching`; `recognition.index` hashes its bits
+    the descriptor       `share.vision.orb`, `share.vision.matching`; size: `share.types.DESCRIPTOR_BYTES`;
+                         `recognition.index` hashes its bits, `recognition.verification` bounds distances
     the verification     `recognition.verification`; `MIN_INLIERS`
     the loop's pose      `recognition.patch_alignment`, also its covariance
     accepting loops      `loop_acceptance`; `merge.join_places`

@@ -18,7 +18,8 @@ those out of view rest in `dormant_features`. The beginning: `initialisation`; o
 
 To change:
 
-    the gate             `filter.GATE`, applied in `visual_update._gate`
+    the gate             `filter.GATE`, applied in `visual_update._gate`; to features that come back in
+                         `landmarks`, at rest in `filter.zero_velocity_update`
     dynamic features     `visual_update.mark_dynamic`
     new features         `landmarks`, `share.vision.corners`; their number: `inertial.features`
     the patches          `feature_appearance`, `share.vision.patches`

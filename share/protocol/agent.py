@@ -12,16 +12,17 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from share.config import Config
-from share.errors import UsageError, WireError
+from share.errors import UsageError
 from share.metrics.frame_log import summary
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry
 from share.protocol.agent_status import StatusReporter, with_link
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, SendToEdge
 from share.protocol.edge_clock import ClockEstimate, PingTracker
 from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
 from share.protocol.keyframe_pace import KeyframePace
 from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
-from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
+from share.timing import PeriodicTimer, seconds_to_ns
 from share.types import F64, Correction, KeyframeCandidate
 from share.wire import messages as m
 from share.wire.codec import encode, message_bytes
@@ -30,7 +31,7 @@ from share.wire.layouts import Bytes
 EVALUATION_S = 1.0  # longest interval of evaluations: with few keyframes the edge has to know sooner
 NO_KEYFRAME = -1  # of an evaluation between keyframes
 _COUNTERS = (
-    *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
+    *("bytes_up", "bytes_down", "poses", "candidates", "drop_rate"),
     *("corrections", "corrections_stale"),
 )
 _LEDGER_COUNTERS = (
@@ -63,7 +64,6 @@ class Agent:
         self._status_reporter = StatusReporter(self.slow_text)
         self._connection = EdgeConnection(hello, config.link.silent_s, self.offline_text)
         self._pings = PingTracker()
-        self._line_limiter = LineLimiter()
         self._finish_deadline_ns: int | None = None
         self._ended = False
         self._counts: Counter[str] = Counter()
@@ -86,12 +86,12 @@ class Agent:
                 self._on_keyframe_made(event.frame, event.candidate)
             case ev.FrameArrived():
                 self._on_frame_arrived(event)
-            case ev.EdgeMessageReceived():
+            case EdgeMessageReceived():
                 self._on_received(event.frames)
             case ev.InputFinished():
                 self._status_reporter.finish()
                 self._finish_deadline_ns = now_ns + seconds_to_ns(self._config.agent.finish_s)
-            case ev.Connected():  # a welcome tells sooner than a pong whether this edge knows us
+            case Connected():  # a welcome tells sooner than a pong whether this edge knows us
                 self._connection.mark_reached()
                 self._send_hello()
             case ev.AgentTick():
@@ -114,6 +114,7 @@ class Agent:
         return {
             **{name: self._counts[name] for name in _COUNTERS},
             **{name: self._ledger.counts[name] for name in _LEDGER_COUNTERS},
+            "bad_messages": self._connection.bad_messages,
             "keyframes": self._keyframe_chain.next_id,
             "pending": len(self._ledger.pending),
             "kept": len(self._ledger),
@@ -201,16 +202,11 @@ class Agent:
 
     def _on_received(self, frames: Sequence[Bytes]) -> None:
         self._counts["bytes_down"] += message_bytes(frames)
-        try:
-            message, line = self._connection.decode(frames)
-        except WireError as error:
-            self._report_invalid(f"invalid message from the edge: {error}")
-            return
-        if message is None:
-            self._print(line)
-            return
-        self._connection.mark_received(self._now_ns)
+        message, lines = self._connection.receive(frames, self._now_ns)
+        self._effects += lines
         match message:
+            case None:
+                pass
             case m.Welcome():
                 self._on_welcome(message)
             case m.Refused():
@@ -234,14 +230,10 @@ class Agent:
         self._pace.acknowledge(acks_ms, self._now_ns)
 
     def _on_other_message(self, message: m.Message) -> None:
-        name = type(message).__name__
-        self._report_invalid(f"the edge sent a {name}, which this agent does not expect")
+        self._effects += self._connection.report_unexpected(message, "this agent", self._now_ns)
 
     def _report_invalid(self, text: str) -> None:
-        """Count a message that no edge should send, and print it if new."""
-        self._counts["bad_messages"] += 1
-        if (line := self._line_limiter.admit_new(text, self._now_ns)) is not None:
-            self._effects.append(ev.PrintLine(line))
+        self._effects += self._connection.report_invalid(text, self._now_ns)
 
     def _is_of_sent(self, message_name: str, *keyframes: int) -> bool:
         """Return whether an edge can have these keyframes; report a message about others."""
@@ -284,7 +276,7 @@ class Agent:
         is_new_run = self._status_reporter.has_just_begun(self._now_ns, self._connection.silence_limit_ns)
         if self._connection.sessions.session is None and is_new_run:
             self._ended = True
-            self._effects.append(ev.FailRun(UsageError(text)))
+            self._effects.append(FailRun(UsageError(text)))
         else:
             self._print(f"{text}; {self.offline_text}")
 
@@ -317,7 +309,7 @@ class Agent:
     # ------------------------------------------------------------ messages to the edge
 
     def _send_due(self) -> None:
-        self._print(self._connection.check_silence(self._now_ns))
+        self._effects += self._connection.check_silence(self._now_ns)
         self._send_status()
         if self.is_connected:
             if (ping := self._pings.due_ping(self._now_ns)) is not None:
@@ -364,13 +356,12 @@ class Agent:
 
     def _send_frames(self, frames: Sequence[Bytes], keyframe: int | None = None) -> None:
         self._counts["bytes_up"] += message_bytes(frames)
-        self._effects.append(ev.SendToEdge(frames, keyframe))
+        self._effects.append(SendToEdge(frames, keyframe))
 
-    def _on_send_failed(self, effect: ev.SendToEdge | ev.SendFrameToEdge) -> None:
+    def _on_send_failed(self, effect: SendToEdge | ev.SendFrameToEdge) -> None:
         self._counts["bytes_up"] -= message_bytes(effect.frames)
-        if isinstance(effect, ev.SendToEdge) and effect.keyframe_id is not None:
+        if isinstance(effect, SendToEdge) and effect.keyframe_id is not None:
             self._ledger.record_send_failure(effect.keyframe_id)
 
-    def _print(self, text: str | None) -> None:
-        if text is not None and (line := self._line_limiter.admit(text, self._now_ns)) is not None:
-            self._effects.append(ev.PrintLine(line))
+    def _print(self, text: str) -> None:
+        self._effects += self._connection.print(text, self._now_ns)

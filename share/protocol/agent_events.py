@@ -1,12 +1,12 @@
 """Events and effects of the agent's state machine. Times are host monotonic ns; `stamp_ns` is the frame's
-stamp in the sensor's clock."""
+stamp in the sensor's clock. What clients of a room have too is in `share.protocol.common_events`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from share.errors import ShareError
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.types import F64, Frame, KeyframeCandidate, TrackState, WaitReason
 from share.wire.layouts import Bytes
 from share.wire.messages import Status
@@ -66,18 +66,6 @@ class SendFailed:
     effect: SendToEdge | SendFrameToEdge
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeMessageReceived:
-    """A message from the edge, undecoded."""
-
-    frames: Sequence[Bytes]
-
-
-@dataclass(frozen=True)
-class Connected:
-    """The link has reached an edge, perhaps a restarted one."""
-
-
 @dataclass(frozen=True)
 class AgentTick:
     """Time has passed; every 50 ms suffices.
@@ -106,14 +94,6 @@ AgentEvent = (
 )
 
 # ---------------------------------------------------------------- effects
-
-
-@dataclass(frozen=True, eq=False)
-class SendToEdge:
-    """Hand a message to the link; answer `SendFailed` if it refuses. keyframe_id: None if it is none."""
-
-    frames: Sequence[Bytes]
-    keyframe_id: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,20 +175,6 @@ class StatusReport:
     status: Status
     stamp_ns: int | None
     is_stale: bool
-
-
-@dataclass(frozen=True)
-class PrintLine:
-    """One line for a person."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class FailRun:
-    """The run cannot go on; `error` says why."""
-
-    error: ShareError
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from share.mapping.map_changes import SaveKeyframe, SaveObject, SavePoses, SaveR
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.admission import RunRegistry
+from share.protocol.common_events import Tick
 from share.protocol.edge_membership import RoomMembership, RunTrackers
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.keyframe_intake import KeyframeQuota, OdometryBase, sanitise
@@ -102,7 +103,7 @@ class Edge:
             case ed.ChangesSaved():
                 self._acknowledge(*self._out.durability.mark_saved(event.ticket))
                 self.room.mark_saved(event.ticket)
-            case ed.EdgeTick():
+            case Tick():
                 self._membership.check_silence()
                 self.room.tick()
 

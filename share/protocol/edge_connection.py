@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Sequence
 from enum import Enum, auto
 
-from share.errors import VersionError, printable
+from share.errors import VersionError, WireError, printable
+from share.protocol.common_events import PrintLine
 from share.protocol.versions import EdgeVersionProbe
-from share.timing import PeriodicTimer, seconds_to_ns
+from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 from share.wire.layouts import Bytes
@@ -72,7 +73,7 @@ class WelcomeOutcome(Enum):
 
 
 class EdgeConnection:
-    """Whether an edge serves the agent. Methods that return text return a line for a person, or None.
+    """Whether an edge serves the agent, and what a person is shown of it.
 
     offline_text: what becomes of the agent without an edge.
     """
@@ -81,10 +82,12 @@ class EdgeConnection:
         self.is_connected = False  # an edge has welcomed it and is not silent
         self.refusal: str | None = None  # last reason that the edge gave
         self.sessions = EdgeSessions()
+        self.bad_messages = 0  # that no edge should send
         self.silence_limit_ns = seconds_to_ns(silent_s)
         self._name, self._hello, self._offline_text = hello.name, encode(hello), offline_text
         self._hello_timer = PeriodicTimer(HELLO_S)
         self._version_probe = EdgeVersionProbe()
+        self._line_limiter = LineLimiter()
         self._last_received_ns: int | None = None  # or the first event
         self._silence_reported = False
 
@@ -97,10 +100,6 @@ class EdgeConnection:
         """Record that the link has reached an edge."""
         self._version_probe.mark_reached()
 
-    def mark_received(self, now_ns: int) -> None:
-        """Record a message of the edge."""
-        self._last_received_ns = now_ns
-
     def is_hello_due(self, now_ns: int) -> bool:
         return not self.is_connected and self._hello_timer.fire_if_due(now_ns)
 
@@ -110,28 +109,37 @@ class EdgeConnection:
         self.sessions.expect_welcome()
         return [self._hello, *self._version_probe.pings(now_ns)]
 
-    def decode(self, frames: Sequence[Bytes]) -> tuple[m.Message | None, str | None]:
-        """Return the message; or None and a line, of an edge of an older version. Raises WireError."""
+    def receive(self, frames: Sequence[Bytes], now_ns: int) -> tuple[m.Message | None, list[PrintLine]]:
+        """Return the message; or None, and why, where it is invalid or of an edge of an older version."""
         try:
-            return decode(frames), None
-        except VersionError as error:
-            line = self._version_probe.check_message(frames, error)
-            if line is None:
-                return None, None
-            self._silence_reported = True
-            return None, f"{line}; {self._offline_text}"
+            try:
+                message = decode(frames)
+            except VersionError as error:
+                return None, self._report_version(frames, error, now_ns)
+        except WireError as error:
+            return None, self.report_invalid(f"invalid message from the edge: {error}", now_ns)
+        self._last_received_ns = now_ns
+        return message, []
 
-    def check_silence(self, now_ns: int) -> str | None:
-        """Disconnect from an edge that is silent; return a line, once."""
+    def _report_version(self, frames: Sequence[Bytes], error: VersionError, now_ns: int) -> list[PrintLine]:
+        """Return the line about an edge of an older version, once. Raises the error of any other message."""
+        line = self._version_probe.check_message(frames, error)
+        if line is None:
+            return []
+        self._silence_reported = True
+        return self.print(f"{line}; {self._offline_text}", now_ns)
+
+    def check_silence(self, now_ns: int) -> list[PrintLine]:
+        """Disconnect from an edge that is silent, and say so once."""
         assert self._last_received_ns is not None
         if now_ns - self._last_received_ns <= self.silence_limit_ns:
-            return None
+            return []
         self.is_connected = False
         if self._silence_reported:
-            return None
+            return []
         self._silence_reported = True
         problem = "the edge is silent" if self.sessions.session is not None else "no edge answers yet"
-        return f"{problem}; {self._offline_text}"
+        return self.print(f"{problem}; {self._offline_text}", now_ns)
 
     def welcome(self, welcome: m.Welcome) -> WelcomeOutcome:
         """Connect, unless the welcome is of an earlier session or no hello asked for it."""
@@ -153,3 +161,21 @@ class EdgeConnection:
         self.refusal = printable(refused.reason)
         self._hello_timer.postpone(now_ns + seconds_to_ns(REFUSED_S))
         return f"the edge refuses '{self._name}': {self.refusal}"
+
+    # ------------------------------------------------------------ lines for a person
+
+    def print(self, text: str, now_ns: int) -> list[PrintLine]:
+        """Return the line, unless there are too many."""
+        line = self._line_limiter.admit(text, now_ns)
+        return [] if line is None else [PrintLine(line)]
+
+    def report_invalid(self, text: str, now_ns: int) -> list[PrintLine]:
+        """Count a message that no edge should send; return its line if it is new."""
+        self.bad_messages += 1
+        line = self._line_limiter.admit_new(text, now_ns)
+        return [] if line is None else [PrintLine(line)]
+
+    def report_unexpected(self, message: m.Message, receiver: str, now_ns: int) -> list[PrintLine]:
+        """Count a message that is not for this kind of receiver; return its line if it is new."""
+        name = type(message).__name__
+        return self.report_invalid(f"the edge sent a {name}, which {receiver} does not expect", now_ns)

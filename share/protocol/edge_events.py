@@ -11,6 +11,7 @@ from share.geometry.camera import Rig
 from share.mapping.corrections import MapEvent
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange
+from share.protocol.common_events import Tick
 from share.types import Frame, Keyframe
 from share.wire import messages as wire
 from share.wire.layouts import Bytes
@@ -53,11 +54,6 @@ class ChangesSaved:
     ticket: int
 
 
-@dataclass(frozen=True)
-class EdgeTick:
-    """Time has passed."""
-
-
 # ---------------------------------------------------------------- events of trackers
 
 
@@ -84,7 +80,7 @@ class TrackerLost:
 
 
 TrackerEvent = TrackerReady | TrackerAnswered | TrackerLost
-EdgeEvent = PeerMessageReceived | MapperResult | ChangesSaved | EdgeTick | TrackerEvent
+EdgeEvent = PeerMessageReceived | MapperResult | ChangesSaved | Tick | TrackerEvent
 
 # ---------------------------------------------------------------- effects
 

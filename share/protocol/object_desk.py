@@ -91,25 +91,25 @@ class ObjectDesk:
         """Return the ticket of the change. Raises ValueError for what is refused."""
         if isinstance(message, RemoveObject):
             gone = self.objects.remove(message.object_id, f"removed by '{client.name}'", self._out.now_ns)
-            return self._tell(gone)
+            return self._announce(gone)
         map_id = default_map if message.map_id is None else message.map_id
         if map_id is None:
             raise ValueError("the room has no map yet, or several; name one (map_id)")
         if (place := self._maps.place(map_id, message.T_map_object)) is None:
             raise ValueError(f"there is no map {map_id}")
-        return self._tell(self.objects.put(client.name, message.object_id, message.kind, *place))
+        return self._announce(self.objects.put(client.name, message.object_id, message.kind, *place))
 
-    def _tell(self, change: SaveObject | RoomObject) -> int | None:
+    def _announce(self, change: SaveObject | RoomObject) -> int | None:
         """Store a change, record it unless it is a mere move, and send it to all that want it. Return its
         ticket."""
-        told = change.object if isinstance(change, SaveObject) else change
-        if told.removed:
-            self._out.record("object removed", None, f"{told.kind} {told.object_id}: {told.removed}")
+        sent = change.object if isinstance(change, SaveObject) else change
+        if sent.removed:
+            self._out.record("object removed", None, f"{sent.kind} {sent.object_id}: {sent.removed}")
         for client in self._wanting():
-            self._clients.send(client, told)
+            self._clients.send(client, sent)
             client.list_pause_s = _LIST_S
             client.list_due_ns = self._out.now_ns + seconds_to_ns(_LIST_S)
-        kept = change if isinstance(change, SaveObject) else RemoveStoredObject(told.object_id)
+        kept = change if isinstance(change, SaveObject) else RemoveStoredObject(sent.object_id)
         return self._out.save(kept)
 
     def _wanting(self) -> list[Client]:
@@ -147,7 +147,7 @@ class ObjectDesk:
         """Move the objects of a map that moved into another."""
         changes = self.objects.follow(move, self._out.now_ns)
         for change in changes:
-            self._tell(change)
+            self._announce(change)
         if changes:
             moved = f"{len(changes)} objects of map {move.old} are in map {move.new} now"
             self._out.record("objects moved", None, moved, map_id=move.new)
@@ -156,7 +156,7 @@ class ObjectDesk:
         """Remove the objects whose map is gone, by the maps of a solution."""
         self._maps.add_solved(map_ids)
         for gone in self.objects.remove_missing(lambda one: one in self._maps, self._out.now_ns):
-            self._tell(gone)
+            self._announce(gone)
 
     def mark_saved(self, ticket: int) -> None:
         """Acknowledge the requests that are stored up to this ticket."""

@@ -10,12 +10,12 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from share.errors import UsageError, WireError
-from share.protocol import agent_events as ag
+from share.errors import UsageError
 from share.protocol import room_events as ev
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, SendToEdge, Tick
 from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
 from share.protocol.object_mirror import ObjectMirror
-from share.timing import SECOND_NS, LineLimiter, PeriodicTimer, seconds_to_ns
+from share.timing import SECOND_NS, PeriodicTimer, seconds_to_ns
 from share.wire import messages as m
 from share.wire import room_messages as room
 from share.wire.codec import encode
@@ -57,7 +57,6 @@ class RoomClient:
         self._requests: dict[int, _OpenRequest] = {}
         self._commands: dict[int, _OpenCommand] = {}
         self._ended: deque[int] = deque(maxlen=MAX_OPEN)  # commands
-        self._lines = LineLimiter()
         self._is_over = False
         self._effects: list[ev.ClientEffect] = []
         self._now_ns = 0
@@ -89,40 +88,40 @@ class RoomClient:
         self._effects, self._now_ns = [], now_ns
         self._connection.begin(now_ns)
         match event:
-            case ag.EdgeMessageReceived():
+            case EdgeMessageReceived():
                 self._on_received(event.frames)
-            case ag.Connected():
+            case Connected():
                 self._connection.mark_reached()
                 self._send_hello()
-            case ev.RequestWanted():
-                self._on_request(event.message)
-            case ev.CommandWanted():
-                self._on_command(event.message)
-            case ev.BridgeSaid():
-                self._send_if_connected(event.message)
+            case ev.MessageWanted():
+                self._on_wanted(event.message)
             case ev.ClientEnded():
                 self._send_if_connected(m.Bye())
                 self._is_over = True
                 return self._effects
-            case ev.ClientTick():
+            case Tick():
                 pass
         if not self._is_over:
             self._send_due()
         return self._effects
 
+    def _on_wanted(self, message: room.ClientUplink) -> None:
+        match message:
+            case room.PutObject() | room.RemoveObject():
+                self._on_request(message)
+            case room.Goto() | room.Cancel():
+                self._on_command(message)
+            case _:
+                self._send_if_connected(message)
+
     # ------------------------------------------------------------ messages from the edge
 
     def _on_received(self, frames: Sequence[Bytes]) -> None:
-        try:
-            message, line = self._connection.decode(frames)
-        except WireError as error:
-            self._report_invalid(f"invalid message from the edge: {error}")
-            return
-        if message is None:
-            self._print(line)
-            return
-        self._connection.mark_received(self._now_ns)
+        message, lines = self._connection.receive(frames, self._now_ns)
+        self._effects += lines
         match message:
+            case None:
+                pass
             case m.Welcome():
                 self._on_welcome(message)
             case m.Refused():
@@ -140,8 +139,7 @@ class RoomClient:
             case room.Goto() | room.Cancel() if self._hello.drives_robot:
                 self._effects.append(ev.RobotCommanded(message))
             case _:
-                name = type(message).__name__
-                self._report_invalid(f"the edge sent a {name}, which this client does not expect")
+                self._effects += self._connection.report_unexpected(message, "this client", self._now_ns)
 
     def _on_welcome(self, welcome: m.Welcome) -> None:
         is_restart = self._connection.sessions.session is not None
@@ -154,7 +152,8 @@ class RoomClient:
                 self._hasten()
                 self._print("reconnected to the edge")
             case WelcomeOutcome.UNSOLICITED:
-                self._report_invalid("the edge sent a welcome without a hello; ignored")
+                text = "the edge sent a welcome without a hello; ignored"
+                self._effects += self._connection.report_invalid(text, self._now_ns)
 
     def _hasten(self) -> None:
         """Send everything that is open now."""
@@ -169,7 +168,7 @@ class RoomClient:
             self._print(f"{text}; it goes on trying")
             return
         self._is_over = True
-        self._effects.append(ag.FailRun(UsageError(text)))
+        self._effects.append(FailRun(UsageError(text)))
 
     def _on_pong(self, pong: m.Pong) -> None:
         if (ping := m.Ping(pong.sequence, pong.sent_ns)) not in self._pings:
@@ -251,7 +250,7 @@ class RoomClient:
     # ------------------------------------------------------------ messages to the edge
 
     def _send_due(self) -> None:
-        self._print(self._connection.check_silence(self._now_ns))
+        self._effects += self._connection.check_silence(self._now_ns)
         for command, open_command in list(self._commands.items()):
             if self._now_ns - open_command.heard_ns > _NO_WORD_S * SECOND_NS:
                 self._give_up(command, open_command)
@@ -277,19 +276,14 @@ class RoomClient:
         return sent_ns is None or self._now_ns - sent_ns >= seconds_to_ns(REPEAT_S)
 
     def _send_hello(self) -> None:
-        self._effects += [ag.SendToEdge(frames) for frames in self._connection.hello(self._now_ns)]
+        self._effects += [SendToEdge(frames) for frames in self._connection.hello(self._now_ns)]
 
     def _send(self, message: m.UplinkMessage | room.ClientUplink) -> None:
-        self._effects.append(ag.SendToEdge(encode(message)))
+        self._effects.append(SendToEdge(encode(message)))
 
     def _send_if_connected(self, message: m.UplinkMessage | room.ClientUplink) -> None:
         if self.is_connected:
             self._send(message)
 
-    def _report_invalid(self, text: str) -> None:
-        if (line := self._lines.admit_new(text, self._now_ns)) is not None:
-            self._effects.append(ag.PrintLine(line))
-
-    def _print(self, text: str | None) -> None:
-        if text is not None and (line := self._lines.admit(text, self._now_ns)) is not None:
-            self._effects.append(ag.PrintLine(line))
+    def _print(self, text: str) -> None:
+        self._effects += self._connection.print(text, self._now_ns)

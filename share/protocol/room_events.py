@@ -1,11 +1,18 @@
-"""Events and effects of a client's state machine. It also has `Connected`, `EdgeMessageReceived`,
-`SendToEdge`, `PrintLine` and `FailRun` of agents."""
+"""Events and effects of a client's state machine. What agents have too is in
+`share.protocol.common_events`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from share.protocol.agent_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
+from share.protocol.common_events import (
+    Connected,
+    EdgeMessageReceived,
+    FailRun,
+    PrintLine,
+    SendToEdge,
+    Tick,
+)
 from share.wire.room_messages import (
     Cancel,
     CommandState,
@@ -20,24 +27,12 @@ from share.wire.room_messages import (
 
 
 @dataclass(frozen=True)
-class RequestWanted:
-    """Place or remove an object; `RequestAnswered` follows. Numbers of requests rise."""
+class MessageWanted:
+    """A message for the edge. `PutObject` and `RemoveObject`: `RequestAnswered` follows. `Goto` and `Cancel`:
+    `CommandChanged` follows, the last one final. Numbers of requests and of commands rise. What a bridge says
+    of a command or of its robot's place is sent once."""
 
-    message: PutObject | RemoveObject
-
-
-@dataclass(frozen=True)
-class CommandWanted:
-    """Send or stop a robot; `CommandChanged` follows, the last one final. Numbers of commands rise."""
-
-    message: Goto | Cancel
-
-
-@dataclass(frozen=True)
-class BridgeSaid:
-    """A bridge says what becomes of a command, or where its robot is."""
-
-    message: CommandState | RobotPlace
+    message: PutObject | RemoveObject | Goto | Cancel | CommandState | RobotPlace
 
 
 @dataclass(frozen=True)
@@ -45,14 +40,7 @@ class ClientEnded:
     """The run is over."""
 
 
-@dataclass(frozen=True)
-class ClientTick:
-    """Time has passed; every 50 ms suffices."""
-
-
-ClientEvent = (
-    Connected | EdgeMessageReceived | RequestWanted | CommandWanted | BridgeSaid | ClientEnded | ClientTick
-)
+ClientEvent = Connected | EdgeMessageReceived | MessageWanted | ClientEnded | Tick
 
 # ---------------------------------------------------------------- effects
 

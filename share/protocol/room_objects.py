@@ -57,7 +57,7 @@ class RoomObjects:
         return self._keep(RoomObject(self._session, 0, object_id, kind, owner, map_id, T), map_id)
 
     def remove(self, object_id: int, reason: str, now_ns: int) -> RoomObject:
-        """Remove an object; return it as its removal is told."""
+        """Remove an object; return it as its removal is sent."""
         if (kept := self._kept.pop(object_id, None)) is None:
             raise ValueError(f"there is no object {object_id}")
         self.revision += 1
@@ -69,7 +69,7 @@ class RoomObjects:
         return gone
 
     def follow(self, move: MapMoved, now_ns: int) -> list[SaveObject | RoomObject]:
-        """Move objects with their map; return those that changed, removed ones as they are told."""
+        """Move objects with their map; return those that changed, removed ones as they are sent."""
         out: list[SaveObject | RoomObject] = []
         for kept in self.kept():
             if kept.object.map_id != move.old or not (move.is_join or kept.home_map == move.new):

@@ -11,6 +11,7 @@ from typing import Any
 from share.config import Config, StreamConfig
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import SendToEdge
 from share.timing import seconds_to_ns
 from share.types import Frame, ImuBatch
 from share.wire.codec import encode, message_bytes
@@ -200,7 +201,7 @@ class StreamingAgent(Agent):
             self._counts["bytes_up"] += message_bytes(frames)
             self._effects.append(ev.SendFrameToEdge(frame.index, frames))
 
-    def _on_send_failed(self, effect: ev.SendToEdge | ev.SendFrameToEdge) -> None:
+    def _on_send_failed(self, effect: SendToEdge | ev.SendFrameToEdge) -> None:
         super()._on_send_failed(effect)
         if isinstance(effect, ev.SendFrameToEdge):
             self._streamer.cancel(effect.index)

@@ -10,9 +10,10 @@ import math
 from typing import Any
 
 from share.errors import printable
+from share.protocol.common_events import PrintLine, Tick
 from share.robot import robot_events as ev
 from share.robot.goal_control import ActiveGoal, GoalControl
-from share.robot.map_odom import MapMoved, MapOdom
+from share.robot.map_odom import MapJumped, MapOdom
 from share.robot.planar import PlanarPose
 from share.robot.settings import RobotSettings
 from share.timing import LineLimiter, PeriodicTimer, seconds_to_ns
@@ -51,7 +52,7 @@ class RobotBridge:
             case ev.AgentPoseReceived():
                 self._on_pose(event)
             case ev.OdometryReceived():
-                self._on_map_moved(self._place.add_odometry(event, now_ns))
+                self._on_map_jumped(self._place.add_odometry(event, now_ns))
                 self._check_speed(event.speed_m_s)
             case ev.ForeignMapFrame():
                 self._place.add_foreign(printable(event.frame)[:_MAX_NAME_LENGTH], now_ns)
@@ -73,7 +74,7 @@ class RobotBridge:
                 self._goals.take_answer(event, now_ns)
             case ev.ResultReceived():
                 self._effects += self._goals.take_result(event)
-            case ev.BridgeTick():
+            case Tick():
                 pass
         self._check_place()
         self._effects += self._goals.tick(now_ns)
@@ -110,7 +111,7 @@ class RobotBridge:
     # ------------------------------------------------------------ the robot's place
 
     def _on_pose(self, pose: ev.AgentPoseReceived) -> None:
-        self._on_map_moved(self._place.add_pose(pose, self._now_ns))
+        self._on_map_jumped(self._place.add_pose(pose, self._now_ns))
         if self._area_map is None:
             self._area_map = self._place.map_id
         if pose.has_edge is not False:
@@ -118,10 +119,10 @@ class RobotBridge:
         elif self._edge_lost_ns is None:
             self._edge_lost_ns = self._now_ns
 
-    def _on_map_moved(self, moved: MapMoved | None) -> None:
-        if moved is not None:
-            self._print(moved.text)
-            self._stop(f"{moved.text}: give the goal again")
+    def _on_map_jumped(self, jumped: MapJumped | None) -> None:
+        if jumped is not None:
+            self._print(jumped.text)
+            self._stop(f"{jumped.text}: give the goal again")
 
     def _check_place(self) -> None:
         """Publish where the robot is; or stop it, once, where that is not known any more."""
@@ -280,4 +281,4 @@ class RobotBridge:
 
     def _print(self, text: str) -> None:
         if (line := self._line_limiter.admit(text, self._now_ns)) is not None:
-            self._effects.append(ev.BridgeLine(line))
+            self._effects.append(PrintLine(line))

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 from share.errors import printable
+from share.protocol.common_events import PrintLine
 from share.robot import robot_events as ev
 from share.robot.planar import PlanarPose
 from share.timing import PeriodicTimer, seconds_to_ns
@@ -150,7 +151,7 @@ class GoalControl:
         if now_ns - stopped_ns > seconds_to_ns(_UNCONFIRMED_S) and not goal.is_unconfirmed:
             self.active = replace(goal, is_unconfirmed=True)
             text = "the robot does not confirm that it stops; stop it by hand"
-            effects += [ev.BridgeLine(text), _report(goal, text)]
+            effects += [PrintLine(text), _report(goal, text)]
         return effects
 
     def _cancel_orphans(self, statuses: dict[bytes, ev.GoalStatus], now_ns: int) -> list[ev.RobotEffect]:
@@ -165,7 +166,7 @@ class GoalControl:
         if not orphans or not self._orphan_timer.fire_if_due(now_ns):
             return []
         text = "the robot was still driving to a goal that nobody follows; it is cancelled"
-        return [ev.BridgeLine(text), *(ev.CancelGoal(goal_id) for goal_id in orphans)]
+        return [PrintLine(text), *(ev.CancelGoal(goal_id) for goal_id in orphans)]
 
     def _end(self, text: str, is_reached: bool = False) -> list[ev.RobotEffect]:
         assert self.active is not None

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from share.errors import ConfigError, DataError
 from share.files.reading import read_bytes, read_errors
 from share.files.yaml_file import read_yaml
-from share.robot.area import DrivingArea
 from share.robot.planar import PlanarPose
+from share.robot.settings import DrivingArea
 from share.vision.image_codec import decode_gray
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1

@@ -27,7 +27,7 @@ _SIMULATED_NS = seconds_to_ns(1e8)  # a clock before 1973 is a simulation's
 
 
 @dataclass(frozen=True)
-class MapMoved:
+class MapJumped:
     """The map moved under the robot. text: how, for a person."""
 
     text: str
@@ -57,7 +57,7 @@ class MapOdom:
 
     # ------------------------------------------------------------ in
 
-    def add_pose(self, pose: ev.AgentPoseReceived, now_ns: int) -> MapMoved | None:
+    def add_pose(self, pose: ev.AgentPoseReceived, now_ns: int) -> MapJumped | None:
         """Add a message of the pose stream. Return how the map moved by it, if it did."""
         self._agent = self._agent or pose.agent
         if pose.agent != self._agent or self._is_late(pose.sequence):
@@ -73,7 +73,7 @@ class MapOdom:
         self._pending.append((self._pose_ns, T_map_base, pose.map_id))
         return self._resolve()
 
-    def add_odometry(self, event: ev.OdometryReceived, now_ns: int) -> MapMoved | None:
+    def add_odometry(self, event: ev.OdometryReceived, now_ns: int) -> MapJumped | None:
         """Add a sample of odometry. Return how the map moved by the poses that waited for it."""
         self._odometry_fault = _odometry_fault(event)
         if self._odometry_fault is not None:
@@ -102,9 +102,9 @@ class MapOdom:
             return f"{pose.agent}'s position sigma exceeds {self._settings.max_sigma_m:g} m"
         return None
 
-    def _resolve(self) -> MapMoved | None:
+    def _resolve(self) -> MapJumped | None:
         """Take the poses for which odometry is known on both sides. Return the last move of the map."""
-        moved: MapMoved | None = None
+        moved: MapJumped | None = None
         while self._pending:
             pose_ns, T_map_base, map_id = self._pending[0]
             stamp_ns, newest_ns = self._odometry.robot_ns(pose_ns), self._odometry.newest_stamp_ns
@@ -115,16 +115,16 @@ class MapOdom:
                 moved = self._take(T_map_base @ T_odom_base.inverse(), map_id) or moved
         return moved
 
-    def _take(self, T_map_odom: PlanarPose, map_id: str) -> MapMoved | None:
+    def _take(self, T_map_odom: PlanarPose, map_id: str) -> MapJumped | None:
         before, self.T_map_odom = self.T_map_odom, T_map_odom
         map_before, self.map_id = self.map_id, map_id
         if map_before is not None and map_id != map_before:
-            return MapMoved(f"the map is now {map_id}, before {map_before}")
+            return MapJumped(f"the map is now {map_id}, before {map_before}")
         if before is None or (T_odom_base := self._odometry.newest) is None:
             return None
         old, new = before @ T_odom_base, T_map_odom @ T_odom_base
         way_m = old.distance_m(new) + AHEAD_M * abs(wrapped(new.yaw - old.yaw))
-        return MapMoved(f"a correction moved the map by {way_m:.1f} m") if way_m > _MOVED_M else None
+        return MapJumped(f"a correction moved the map by {way_m:.1f} m") if way_m > _MOVED_M else None
 
     # ------------------------------------------------------------ out
 

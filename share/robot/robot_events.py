@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from share.protocol.common_events import PrintLine, Tick
 from share.robot.planar import PlanarPose
 from share.types import F64, TrackState
 
@@ -138,11 +139,6 @@ class ResultReceived:
     text: str = ""
 
 
-@dataclass(frozen=True)
-class BridgeTick:
-    """Time passes; at least 20 times a second."""
-
-
 RobotEvent = (
     AgentPoseReceived
     | OdometryReceived
@@ -155,7 +151,7 @@ RobotEvent = (
     | FeedbackReceived
     | GoalAnswered
     | ResultReceived
-    | BridgeTick
+    | Tick
 )
 
 # ---------------------------------------------------------------- effects
@@ -201,8 +197,7 @@ class LimitSpeed:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """What a commander is told of its goal `goal_id`. is_final: nothing follows. is_reached: it ended
-    there."""
+    """A report to a commander on `goal_id`. is_final: nothing follows. is_reached: the goal ended there."""
 
     commander: str
     text: str
@@ -211,11 +206,4 @@ class GoalReport:
     goal_id: bytes = b""
 
 
-@dataclass(frozen=True)
-class BridgeLine:
-    """One line for a person."""
-
-    text: str
-
-
-RobotEffect = PublishMapOdom | SendGoal | CancelGoal | AskResult | LimitSpeed | GoalReport | BridgeLine
+RobotEffect = PublishMapOdom | SendGoal | CancelGoal | AskResult | LimitSpeed | GoalReport | PrintLine

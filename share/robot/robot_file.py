@@ -13,9 +13,8 @@ import numpy as np
 from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
 from share.geometry.se3 import from_rt, inverse, so3_exp
-from share.robot.area import DrivingArea
 from share.robot.grid import FloorMap, area_grid, free_rectangle, read_grid
-from share.robot.settings import CREATE3_SPEED_M_S, RobotSettings
+from share.robot.settings import CREATE3_SPEED_M_S, DrivingArea, RobotSettings
 from share.types import F64
 
 FREE_SQUARE_M = 40.0  # the map, where neither an area nor a map is given

@@ -33,6 +33,7 @@ from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
 from share.protocol.agent_health import LIMITS
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.protocol.streaming import StreamingAgent
 from share.runtime.arrivals import (
     FrameArrivals,
@@ -231,10 +232,10 @@ class AgentRun:
         frames = self._link.receive(TICK_MS)
         self._notify_trouble()
         if self._link.poll_connected():
-            self._handle(ev.Connected())
+            self._handle(Connected())
         if frames is not None:
             self._messages_in_tick += 1
-            self._handle(ev.EdgeMessageReceived(frames))
+            self._handle(EdgeMessageReceived(frames))
 
     def _handle_posted(self, event: ev.AgentEvent) -> None:
         if isinstance(event, ev.InputFinished):
@@ -267,7 +268,7 @@ class AgentRun:
 
     def _execute(self, effect: ev.AgentEffect) -> None:
         match effect:
-            case ev.SendToEdge() | ev.SendFrameToEdge():
+            case SendToEdge() | ev.SendFrameToEdge():
                 if not self._link.send(effect.frames):
                     self._handle(ev.SendFailed(effect))
             case ev.FrameTrackedRemotely():
@@ -290,9 +291,9 @@ class AgentRun:
                     self._log.add_correction(effect.stamp_ns, effect.corrected_ms)
                 if self._verbose:
                     self._notify(_describe_correction(effect))
-            case ev.PrintLine():
+            case PrintLine():
                 self._notify(effect.text)
-            case ev.FailRun():
+            case FailRun():
                 self._output_writer.submit(self._files.discard)
                 raise effect.error
             case ev.CloseLink():

@@ -36,7 +36,18 @@ _DISABLE_PPD_COMMAND = (
 )
 
 
-def inspect_host(profile: HostProfile, out: Path) -> list[CheckResult]:
+def inspect_device(profile: HostProfile, calib: Path | None, out: Path) -> list[CheckResult]:
+    """Check camera, calibration, computer and port. calib: folder. out: folder whose disk is judged."""
+    sdk = _query_sdk(profile)
+    return [
+        *_inspect_camera(profile, sdk),
+        *_inspect_calibration(profile, calib, sdk),
+        *_inspect_host(profile, out),
+        *_inspect_port(profile),
+    ]
+
+
+def _inspect_host(profile: HostProfile, out: Path) -> list[CheckResult]:
     required = profile.host
     where, free = facts.free_disk_bytes(out)
     return [
@@ -48,15 +59,15 @@ def inspect_host(profile: HostProfile, out: Path) -> list[CheckResult]:
     ]
 
 
-def query_sdk(profile: HostProfile) -> SdkReport | None:
+def _query_sdk(profile: HostProfile) -> SdkReport | None:
     """Return librealsense's view of the cameras; None if the profile's device is no RealSense."""
     if profile.sensor is None or _REALSENSE_MODEL not in profile.sensor.device.model:
         return None
     return devices.probe_sdk()
 
 
-def inspect_camera(profile: HostProfile, sdk: SdkReport | None) -> list[CheckResult]:
-    """sdk: from `query_sdk`."""
+def _inspect_camera(profile: HostProfile, sdk: SdkReport | None) -> list[CheckResult]:
+    """sdk: from `_query_sdk`."""
     if profile.sensor is None or sdk is None:
         return [skipped("camera", f"profile '{profile.name}' has no RealSense camera")]
     required, cameras = profile.host, facts.cameras()
@@ -72,10 +83,10 @@ def inspect_camera(profile: HostProfile, sdk: SdkReport | None) -> list[CheckRes
     ]
 
 
-def inspect_calibration(
+def _inspect_calibration(
     profile: HostProfile, folder: Path | None, sdk: SdkReport | None
 ) -> list[CheckResult]:
-    """sdk: from `query_sdk`."""
+    """sdk: from `_query_sdk`."""
     if profile.sensor is None:
         return [skipped("calibration", f"profile '{profile.name}' has no device")]
     if folder is None:
@@ -91,7 +102,7 @@ def inspect_calibration(
     return [result, check_serial(loaded.serials, () if sdk is None else sdk.serials)]
 
 
-def inspect_port(profile: HostProfile) -> list[CheckResult]:
+def _inspect_port(profile: HostProfile) -> list[CheckResult]:
     """Check the edge's port, only for an edge profile."""
     return [checks.check_port(_PORT, facts.is_port_free(_PORT))] if profile.role == "edge" else []
 

@@ -24,6 +24,7 @@ from share.errors import StoreError
 from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
 from share.protocol.agent_health import trouble_lines
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
 from share.protocol.edge_events import (
     AddKeyframe,
@@ -32,7 +33,6 @@ from share.protocol.edge_events import (
     DropRun,
     EdgeEffect,
     EdgeEvent,
-    EdgeTick,
     MapperResult,
     PeerMessageReceived,
     SaveChanges,
@@ -55,7 +55,7 @@ from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
-from share.runtime.mapper_supervision import MapperProgress, MapperRestarts
+from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
 from share.runtime.run_files import EdgeFiles
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
 from share.runtime.worker_process import WorkerProcess
@@ -67,7 +67,6 @@ from share.wire.room_messages import Permission
 TICK_MS = 50
 _REPORT_S = 0.1  # period of reports
 _POSES_SHOWN_S, _REPORT_SHOWN_S = 0.05, 0.5  # periods of what an observer is shown
-_TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
 MAX_REFUSAL_KINDS = 64  # kinds of refused handshakes that are logged; more are only counted
 _MAX_MESSAGES_PER_STEP = 64  # received before answers, ticks and reports get their turn
 _STALE_REPORT_S = 1.0  # age from which a report is declared stale
@@ -87,21 +86,6 @@ class _MapperDied:
     """The mapper's process has died."""
 
     reason: str
-
-
-class _RecentTroubles:
-    """Lines that are shown as trouble for a while."""
-
-    def __init__(self) -> None:
-        self._until_s: dict[str, float] = {}  # monotonic
-
-    def add(self, text: str, duration_s: float = _TROUBLE_SHOWN_S) -> None:
-        self._until_s[text] = time.monotonic() + duration_s
-
-    def current(self) -> list[str]:
-        now_s = time.monotonic()
-        self._until_s = {text: until_s for text, until_s in self._until_s.items() if now_s < until_s}
-        return list(self._until_s)
 
 
 class EdgeRun:
@@ -132,8 +116,8 @@ class EdgeRun:
         self._incomplete_reason: str | None = None  # why the map file is incomplete at the end
         self._start_ns = time.monotonic_ns()
         self._refused_handshakes: Counter[str] = Counter()  # by refusal line
-        self._troubles = _RecentTroubles()
-        self._other_troubles = _RecentTroubles()  # of one agent or map, not of the edge
+        self._troubles = RecentTroubles()
+        self._other_troubles = RecentTroubles()  # of one agent or map, not of the edge
         self._report: dict[str, Any] = {}
         self._report_due_s = self._reported_s = 0.0  # next and last report, monotonic s
         self._heap = HeapTrimmer()
@@ -273,7 +257,7 @@ class EdgeRun:
         for line in self._link.refusals():
             self._count_refusal(line)
         self._handle_answers()
-        self._handle(EdgeTick())
+        self._handle(Tick())
         if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
             self._restart_mapping(self._restart_reason)
         if time.monotonic() >= self._report_due_s:
@@ -320,7 +304,7 @@ class EdgeRun:
         pause_s = self._restarts.record_death()
         text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
         self._log_event("mapper died", text)
-        self._troubles.add(f"the mapper: {text}", pause_s + _TROUBLE_SHOWN_S)
+        self._troubles.add(f"the mapper: {text}", pause_s + TROUBLE_SHOWN_S)
         if self._mapper_process is not None:
             self._mapper_process.close()
         try:

@@ -1,4 +1,5 @@
-"""Supervision of the mapper: its progress, and after its death, when and with which map it restarts."""
+"""Supervision of the mapper: its progress, troubles of late, and after its death, when and with which map it
+restarts."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from share.store.forgetting import damaged_copies
 from share.store.map_store import MapStore
 from share.timing import Backoff
 
+TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
 _SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
 _MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
 _MAX_TRIES = 3  # mappers that may die while restoring one map, before it is set aside
@@ -141,3 +143,18 @@ def _listed(names: list[str]) -> str:
 
 def _solve_count(report: Mapping[str, Any]) -> int:
     return int(report.get("solve_ms", {}).get("n", 0))
+
+
+class RecentTroubles:
+    """Lines that are shown as trouble for a while."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[str, float] = {}  # monotonic
+
+    def add(self, text: str, duration_s: float = TROUBLE_SHOWN_S) -> None:
+        self._until_s[text] = time.monotonic() + duration_s
+
+    def current(self) -> list[str]:
+        now_s = time.monotonic()
+        self._until_s = {text: until_s for text, until_s in self._until_s.items() if now_s < until_s}
+        return list(self._until_s)

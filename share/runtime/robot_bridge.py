@@ -13,7 +13,8 @@ from dataclasses import replace
 from share.errors import WireError
 from share.geometry.se3 import inverse
 from share.net.udp import Datagram, StampedSocket
-from share.protocol.room_events import BridgeSaid, RobotCommanded
+from share.protocol.common_events import PrintLine, Tick
+from share.protocol.room_events import MessageWanted, RobotCommanded
 from share.robot import robot_events as ev
 from share.robot.bridge import RobotBridge
 from share.robot.goal_control import GOAL_PREFIX
@@ -79,7 +80,7 @@ class RobotBridgeRun:
             self._handle(event)
         if self._room is not None:
             self._serve_edge(self._room)
-        self._handle(ev.BridgeTick())
+        self._handle(Tick())
         self._commands.show(lambda: self.bridge.report(time.monotonic_ns()), time.monotonic_ns())
 
     def _serve_edge(self, room: RoomLink) -> None:
@@ -91,11 +92,11 @@ class RobotBridgeRun:
         self._carry_out(room, *self._wire.tick(now_ns))
         place = self._wire.due_place(lambda: self.bridge.report(now_ns), now_ns)
         if place is not None:
-            room.handle(BridgeSaid(place))
+            room.handle(MessageWanted(place))
 
     def _carry_out(self, room: RoomLink, events: list[ev.RobotEvent], states: list[CommandState]) -> None:
         for state in states:
-            room.handle(BridgeSaid(state))
+            room.handle(MessageWanted(state))
         for event in events:
             self._handle(event)
 
@@ -104,7 +105,7 @@ class RobotBridgeRun:
         if self._room is not None:
             state = self._wire.report(report, time.monotonic_ns())
             if state is not None:
-                self._room.handle(BridgeSaid(state))
+                self._room.handle(MessageWanted(state))
 
     def _goal_id(self) -> bytes:
         return GOAL_PREFIX + secrets.token_bytes(16 - len(GOAL_PREFIX))
@@ -135,6 +136,6 @@ class RobotBridgeRun:
                     self._node.limit_speed(effect.speed_m_s)
                 case ev.GoalReport():
                     self._report(effect)
-                case ev.BridgeLine():
+                case PrintLine():
                     self._print_line(effect.text)
                     self._commands.notify_watchers({"line": effect.text})

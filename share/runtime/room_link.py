@@ -10,8 +10,8 @@ from collections.abc import Callable
 from share.errors import ShareError, describe_exception
 from share.net.keys import AgentKeys
 from share.net.transport import connect
-from share.protocol import agent_events as ag
 from share.protocol import room_events as ev
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge, Tick
 from share.protocol.room_client import RoomClient
 from share.timing import LineLimiter
 from share.wire.room_messages import ClientHello
@@ -59,11 +59,11 @@ class RoomLink:
             return
         for effect in effects:
             match effect:
-                case ag.SendToEdge():
+                case SendToEdge():
                     self._link.send(effect.frames)  # what counts is repeated
-                case ag.PrintLine():
+                case PrintLine():
                     self._print_line(effect.text)
-                case ag.FailRun():
+                case FailRun():
                     raise effect.error
                 case _:
                     self._news.append(effect)
@@ -74,13 +74,13 @@ class RoomLink:
         for i in range(_MAX_MESSAGES):
             frames = self._link.receive(0 if i or self._news else timeout_ms)
             if self._link.poll_connected():
-                self.handle(ag.Connected())
+                self.handle(Connected())
             if frames is None:
                 break
-            self.handle(ag.EdgeMessageReceived(frames))
+            self.handle(EdgeMessageReceived(frames))
         if (trouble := self._link.trouble()) is not None:
             self._say_new(trouble)
-        self.handle(ev.ClientTick())
+        self.handle(Tick())
         news, self._news = self._news, []
         return news
 

@@ -82,7 +82,7 @@ class WebServer:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._selector.register(self._wake_receiver, selectors.EVENT_READ)
-        self._clients: list[_Client] = []  # oldest first
+        self._clients: list[_HttpConnection] = []  # oldest first
         self._cpu_s = 0.0  # CPU time of the thread so far
         self._thread = threading.Thread(target=self._serve, name="web", daemon=True)
         self.endpoint = str(bound).removeprefix("tcp://")
@@ -136,11 +136,11 @@ class WebServer:
         connection.setblocking(False)
         if len(self._clients) == MAX_CONNECTIONS:
             self._drop(self._clients[0])
-        client = _Client(connection)
+        client = _HttpConnection(connection)
         self._clients.append(client)
         self._selector.register(connection, selectors.EVENT_READ, client)
 
-    def _advance(self, client: _Client) -> None:
+    def _advance(self, client: _HttpConnection) -> None:
         try:
             events = client.advance(self._respond)
         except Exception:  # the client has gone, or its request is malformed: only its connection ends
@@ -150,7 +150,7 @@ class WebServer:
         else:
             self._drop(client)
 
-    def _drop(self, client: _Client) -> None:
+    def _drop(self, client: _HttpConnection) -> None:
         self._clients.remove(client)
         self._selector.unregister(client.socket)
         client.socket.close()
@@ -175,7 +175,7 @@ class WebServer:
 
 
 @dataclass(eq=False)
-class _Client:
+class _HttpConnection:
     """One connection: reads a request, sends the response, closes."""
 
     socket: socket.socket

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
 
 from share.errors import ShareError
 from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, PeerConnections, PeerLimits
 from share.net.http_guard import HttpGuard
-from share.view.browser_messages import is_taken
 
 _MAX_MESSAGE_BYTES = 2**14  # from a browser, which sends its camera and what is chosen
 MAX_BROWSERS = 16
@@ -42,23 +44,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
         async def check(connection: Any, request: Any) -> Any:
             while not is_built:  # viser serves before it is ready
                 await asyncio.sleep(0.01)
-            headers: dict[str, str] = {}
-            for name, value in request.headers.raw_items():
-                headers.setdefault(name.lower(), value)
-            refusal = guard.check(request.path, headers)
-            if refusal is not None:
-                response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
-            elif "upgrade" in headers and not connections.admit(connection):
-                response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
-            elif (response := respond(connection, request)) is not None:
-                lines = guard.cookie_headers()
-            for line in lines if response is not None else ():
-                name, _, value = line.partition(": ")
-                response.headers[name] = value
-            if response is not None:
-                response.headers["X-Frame-Options"] = "DENY"
-                response.headers["Referrer-Policy"] = "no-referrer"
-            return response
+            return _answer(connection, request, guard, connections, respond)
 
         ours = {
             "process_request": check,
@@ -80,6 +66,36 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
         )
 
 
+def _answer(
+    connection: Any,
+    request: Any,
+    guard: HttpGuard,
+    connections: PeerConnections,
+    respond: Callable[[Any, Any], Any],
+) -> Any:
+    """Return the response to a request: a refusal, or what `respond` makes of it; None: it becomes a
+    WebSocket."""
+    headers: dict[str, str] = {}
+    for name, value in request.headers.raw_items():
+        headers.setdefault(name.lower(), value)
+    refusal = guard.check(request.path, headers)
+    lines: Sequence[str]
+    if refusal is not None:
+        response, lines = connection.respond(refusal.status, f"{refusal.text}\n"), refusal.headers
+    elif "upgrade" in headers and not connections.admit(connection):
+        response, lines = connection.respond(503, f"{MAX_BROWSERS} browsers connected already\n"), ()
+    elif (response := respond(connection, request)) is not None:
+        lines = guard.cookie_headers()
+    else:
+        return None
+    for line in lines:
+        name, _, value = line.partition(": ")
+        response.headers[name] = value
+    response.headers["X-Frame-Options"] = "DENY"
+    response.headers["Referrer-Policy"] = "no-referrer"
+    return response
+
+
 def remove_tunnel(viser_server: Any) -> None:
     """Refuse browsers' requests for a tunnel to the internet."""
     from viser import _messages
@@ -94,3 +110,57 @@ class _BrowserConnection(BoundedConnection):
         while not is_taken(message := await super().recv(decode)):
             pass
         return message
+
+
+# ---------------------------------------------------------------- messages of browsers
+# viser calls handlers with whatever browsers send, and collects uploads without a limit. What is not one of
+# these three messages, well formed, finite and small, never reaches it.
+
+_Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
+_Three = tuple[_Number, _Number, _Number]
+_Text = Annotated[str, Meta(max_length=200)]
+
+
+class _CameraMessage(Struct, tag_field="type", tag="ViewerCameraMessage"):
+    wxyz: tuple[_Number, _Number, _Number, _Number]
+    position: _Three
+    fov: _Number
+    near: _Number
+    far: _Number
+    image_height: _Number
+    image_width: _Number
+    look_at: _Three
+    up_direction: _Three
+
+
+class _NewValue(Struct, forbid_unknown_fields=True):
+    value: _Text | bool
+
+
+class _Choice(Struct, tag_field="type", tag="GuiUpdateMessage"):
+    uuid: _Text
+    updates: _NewValue
+
+
+class _SceneClick(Struct, tag_field="type", tag="SceneNodeClickMessage"):
+    name: _Text
+    ray_origin: _Three
+    ray_direction: _Three
+    screen_pos: tuple[_Number, _Number]
+    instance_index: int | None = None
+    modifier: _Text | None = None
+    owner: _Text = ""
+
+
+_decoder = msgspec.msgpack.Decoder(_CameraMessage | _Choice | _SceneClick)
+
+
+def is_taken(data: Any) -> bool:
+    """Return whether a message of a browser is one that the room takes."""
+    if not isinstance(data, bytes):
+        return False
+    try:
+        _decoder.decode(data)
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return False
+    return True

@@ -21,8 +21,7 @@ from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
 from share.view.drawing import frusta, lines, named, shifted
-from share.view.loop_lines import LoopLines, Pair
-from share.view.loop_pictures import KeyframePictures, LoopViews, nearest_to_ray
+from share.view.loop_views import KeyframePictures, LoopLines, LoopViews, Pair, nearest_to_ray
 from share.view.map_places import MapPlaces
 
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)

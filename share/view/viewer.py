@@ -126,15 +126,15 @@ class LiveRoom:
 
     def _wait_for_end(self) -> str:
         """Wait for the process to end, or end it if it grows too large or hangs. Return why it ended."""
-        why, last_words, heard = "", "", [self._connection]
+        why, last_words, open_pipes = "", "", [self._connection]
         silent_looks, max_silent = 0, _MAX_START_LOOKS
-        while self._process.sentinel not in (ready := wait([self._process.sentinel, *heard], _LOOK_S)):
+        while self._process.sentinel not in (ready := wait([self._process.sentinel, *open_pipes], _LOOK_S)):
             if not ready:  # counted, not timed: this process may have been stopped for a while itself
                 silent_looks += 1
             else:
                 silent_looks, max_silent = 0, MAX_SILENT_LOOKS
                 if (text := self._hear()) is None:
-                    heard = []
+                    open_pipes = []
                 else:
                     last_words = text
             if not why and (why := _fault(self._process.pid, silent_looks, max_silent)):

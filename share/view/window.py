@@ -19,7 +19,7 @@ from share.net.http_guard import HttpGuard
 from share.types import F64, AgentKind
 from share.view import drawing as dr
 from share.view.guarded_server import guarded_serving, remove_tunnel
-from share.view.loop_pictures import LoopViews, shrunk
+from share.view.loop_views import LoopViews, shrunk
 
 _GREY = (110, 110, 110)
 _POINT_M = 0.03

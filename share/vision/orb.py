@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from share.geometry.camera import Camera, Rig, rays
-from share.types import F32, F64, U8, Frame, KeyframeImage, View
+from share.types import DESCRIPTOR_BYTES, F32, F64, U8, Frame, KeyframeImage, View
 from share.vision import depth as depths
 from share.vision.corners import GRID, UNIFORM_FIELD_DEG, field_mask, spread_order
 
@@ -77,7 +77,7 @@ def _detect(image: U8, count: int, mask: U8 | None = None) -> list[cv2.KeyPoint]
 
 def _describe(image: U8, keypoints: list[cv2.KeyPoint]) -> tuple[F32, U8]:
     if not keypoints:
-        return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+        return np.zeros((0, 2), np.float32), np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
     kept, descriptors = _detector(len(keypoints)).compute(image, keypoints)
     px = np.asarray(cv2.KeyPoint.convert(kept), np.float32).reshape(-1, 2)
     return px, np.asarray(descriptors, np.uint8)

@@ -64,8 +64,8 @@ def _check_place(x: float, y: float, yaw: float | None) -> None:
 class ClientHello:
     """First message of a client, repeated until welcomed. run_id: as in `Hello`.
 
-    drives_robot: it is the bridge of the robot of this name. wants_objects, wants_robots: it is told of
-    objects; of robots and of what becomes of all commands.
+    drives_robot: it is the bridge of the robot of this name. wants_objects, wants_robots: it is sent
+    objects; robots and what becomes of all commands.
     """
 
     name: str

@@ -13,9 +13,10 @@ import pytest
 from click.testing import CliRunner
 
 from share.cli.main import cli
+from share.cli.robot_links import LocalRobot, RobotNews
 from share.errors import ShareError, TransportError, UsageError
 from share.robot import robot_events as ev
-from share.runtime.robot_commands import CommandServer, ask_bridge, command_path
+from share.runtime.robot_commands import CommandServer, command_path
 
 GOAL_ID = b"SHARE\x00\x00\x01" + b"g" * 8
 
@@ -110,19 +111,16 @@ def test_cancel():
 def test_watch_shows_lines_and_where_the_robot_is():
     state = {"pose": [1.0, 2.0, 1.5708], "map_id": "ann-1/0", "fault": None, "refusal": None, "goal": None}
     with Served(lambda server, event: None) as served:
-        answers = ask_bridge(command_path(0, ""), {"do": "watch"})
+        seen = LocalRobot(command_path(0, "")).watch()
         end = time.monotonic() + 5
-        first = threading.Thread(target=lambda: served.__dict__.update(got=next(answers)))
+        first = threading.Thread(target=lambda: served.__dict__.update(got=next(seen)))
         first.start()
         while first.is_alive() and time.monotonic() < end:
             served.server.show(lambda: state, time.monotonic_ns())
             time.sleep(0.01)
         first.join()
-        answers.close()
-    assert served.got == {"state": state}
-    from share.cli.robot import _state_text
-
-    assert _state_text(state) == "x 1.00 y 2.00 m, 90° in ann-1/0"
+        seen.close()
+    assert served.got == RobotNews({"state": state}, "x 1.00 y 2.00 m, 90° in ann-1/0", is_place=True)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from share.geometry import se3
 from share.net.transport import AgentLink, connect
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.types import F64, KeyframeCandidate, TrackState, View
 from share.wire.messages import Hello
 
@@ -83,9 +84,9 @@ class Walker(threading.Thread):
             due = began + k * FRAME_S
             wait = min(0.05, max(0.0, due - time.monotonic()))
             if (frames := link.receive(round(1e3 * wait))) is not None:
-                self._handle(link, ev.EdgeMessageReceived(frames))
+                self._handle(link, EdgeMessageReceived(frames))
             if link.poll_connected():
-                self._handle(link, ev.Connected())
+                self._handle(link, Connected())
             if not told and time.monotonic() >= due:
                 if self._finish.is_set() or k == len(self.script.T_odom_body):
                     self._handle(link, ev.InputFinished())
@@ -112,17 +113,17 @@ class Walker(threading.Thread):
         session = self.machine._connection.sessions.session
         for effect in self.machine.handle(event, time.monotonic_ns()):
             match effect:
-                case ev.SendToEdge():
+                case SendToEdge():
                     link.send(effect.frames)
                 case ev.LocalisedPose():
                     self.odometry.append(effect.T_odom_body)
-                case ev.PrintLine():
+                case PrintLine():
                     self.said.append(effect.text)
                 case ev.CorrectionApplied():
                     self.maps.append((time.monotonic(), effect.map_id))
                     if self.lives and self.lives[-1].corrected is None:
                         self.lives[-1].corrected = time.monotonic()
-                case ev.FailRun():
+                case FailRun():
                     raise effect.error
                 case ev.CloseLink():
                     self._ended = True

@@ -20,6 +20,7 @@ from share.mapping.steps import SolveStep, Step
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
+from share.protocol.common_events import EdgeMessageReceived, SendToEdge, Tick
 from share.protocol.edge import Edge
 from share.types import F64, U8, AgentKind, Keyframe, KeyframeCandidate, TrackState, View
 from share.wire.codec import decode
@@ -169,7 +170,7 @@ class Town:
 
     def keyframes(self, name: str) -> list[Keyframe]:
         """Those that the agent sent, in order."""
-        messages = [decode([bytes(f) for f in e.frames]) for e in self.event(ev.SendToEdge, name)]
+        messages = [decode([bytes(f) for f in e.frames]) for e in self.event(SendToEdge, name)]
         return [message for message in messages if isinstance(message, Keyframe)]
 
     def event(self, effect_type: type, name: str) -> list:
@@ -195,7 +196,7 @@ class Town:
             for act in due:
                 act()
             if self.now_ns % (50 * MS) == 0:
-                self.to_edge(ed.EdgeTick())
+                self.to_edge(Tick())
                 for peer in list(self.agents):
                     self.to_agent(peer, ev.AgentTick())
 
@@ -208,7 +209,7 @@ class Town:
                     for late in self.weather.delays_ns():
                         self._in(
                             late,
-                            lambda peer=peer, copy=copy: self.to_agent(peer, ev.EdgeMessageReceived(copy)),
+                            lambda peer=peer, copy=copy: self.to_agent(peer, EdgeMessageReceived(copy)),
                         )
                 case ed.AddRun(key, hello):
                     edge.mapper.add_run(key, hello)
@@ -242,7 +243,7 @@ class Town:
         agent = self.agents.get(peer)
         for effect in agent.handle(event, self.now_ns) if agent else ():
             self.agent_effects[peer].append(effect)
-            if isinstance(effect, ev.SendToEdge):
+            if isinstance(effect, SendToEdge):
                 frames = [bytes(f) for f in effect.frames]
                 for late in self.weather.delays_ns():
                     self._in(late, lambda frames=frames: self.to_edge(ed.PeerMessageReceived(peer, frames)))

@@ -13,6 +13,7 @@ from helpers.hellos import hello_of
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import EdgeMessageReceived, SendToEdge
 from share.protocol.keyframe_intake import ReorderBuffer
 from share.types import Correction, Keyframe, KeyframeCandidate, TrackState, View
 from share.wire import messages as m
@@ -132,12 +133,12 @@ class World:
         for frames in self.up.arrived(now_ns):
             for answer in self.edge.receive(decode(frames), now_ns) if self.edge else ():
                 self.down.send([bytes(f) for f in encode(answer)], now_ns)
-        received = [ev.EdgeMessageReceived(frames) for frames in self.down.arrived(now_ns)]
+        received = [EdgeMessageReceived(frames) for frames in self.down.arrived(now_ns)]
         for event in (*received, *events, ev.AgentTick()):
             effects = handle(self.agent, event, now_ns)
             self.effects += effects
             for effect in effects:
-                if isinstance(effect, ev.SendToEdge) and self.edge:
+                if isinstance(effect, SendToEdge) and self.edge:
                     self.up.send([bytes(f) for f in effect.frames], now_ns)
 
     @property

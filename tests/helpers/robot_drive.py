@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from share.geometry.se3 import from_rt, inverse, so3_exp
+from share.protocol.common_events import Tick
 from share.robot import robot_events as ev
 from share.robot.bridge import RobotBridge
 from share.robot.planar import PlanarPose
@@ -87,7 +88,7 @@ class RobotDrive:
                 self.handle(self.pose())
             if self.goals and step % 10 == 0:
                 self.handle(ev.StatusReceived(tuple(self.goals)))
-            self.handle(ev.BridgeTick())
+            self.handle(Tick())
         return self.effects[begin:]
 
     def goto(self, x: float = 3.0, y: float = 0.0, commander: str = "ann", **more: object) -> bytes:

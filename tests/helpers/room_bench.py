@@ -12,9 +12,9 @@ from share.config import Config
 from share.geometry import se3
 from share.mapping.corrections import MapEvent, MapsJoined
 from share.mapping.map_changes import SaveObject, SavePoses
-from share.protocol import agent_events as ag
 from share.protocol import edge_events as ed
 from share.protocol import room_events as ev
+from share.protocol.common_events import Connected, EdgeMessageReceived, SendToEdge, Tick
 from share.protocol.edge import Edge
 from share.protocol.room_client import RoomClient
 from share.types import F64, Correction
@@ -91,6 +91,9 @@ class RoomBench:
     def agent(self, name: str, run_id: int) -> str:
         """A present agent; return its run's key."""
         self.deliver(peer_id(run_id), encode(hello_of(name, run_id)))
+        return self.run_key(name)
+
+    def run_key(self, name: str) -> str:
         return next(run.key for run in self.edge.room._runs.present() if run.name == name)
 
     def correct(self, run: str, map_id: str, T_map_odom: F64, keyframe: int = 0) -> None:
@@ -117,13 +120,13 @@ class RoomBench:
         drives = hello.get("drives_robot", False)
         self.clients[peer] = RoomClient(room.ClientHello(name, run_id, **hello), 3.0, keeps_trying=drives)
         self.names[peer], self.effects[peer] = name, []
-        self.to_client(peer, ag.Connected())
+        self.to_client(peer, Connected())
         return peer
 
     def to_client(self, peer: bytes, event: ev.ClientEvent) -> None:
         for effect in self.clients[peer].handle(event, self.now_ns):
             self.effects[peer].append(effect)
-            if isinstance(effect, ag.SendToEdge):
+            if isinstance(effect, SendToEdge):
                 self._send(peer, True, [bytes(part) for part in effect.frames])
 
     def of(self, peer: bytes, kind: type) -> list:
@@ -134,7 +137,7 @@ class RoomBench:
         self, peer: bytes, request: int, object_id: int, T: F64, map_id: str | None = None, **more
     ) -> None:
         kind = more.get("kind", ObjectKind.CUBE)
-        self.to_client(peer, ev.RequestWanted(room.PutObject(request, object_id, kind, map_id, T)))
+        self.to_client(peer, ev.MessageWanted(room.PutObject(request, object_id, kind, map_id, T)))
 
     # ------------------------------------------------------------ the network
 
@@ -166,15 +169,15 @@ class RoomBench:
         end_ns = self.now_ns + round(seconds * 1e9)
         while self.now_ns < end_ns:
             self.now_ns += step_ms * MS
-            self._pass_on()
-            self.to_edge(ed.EdgeTick())
+            self.pass_on()
+            self.to_edge(Tick())
             if self.tickets and not self.is_disk_slow:
                 self.to_edge(ed.ChangesSaved(self.tickets.pop()))
                 self.tickets.clear()
             for peer in self.clients:
-                self.to_client(peer, ev.ClientTick())
+                self.to_client(peer, Tick())
 
-    def _pass_on(self) -> None:
+    def pass_on(self) -> None:
         for _ in range(20):  # answers of answers, in one step
             due = sorted((one for one in self.under_way if one[0] <= self.now_ns), key=lambda one: one[0])
             if not due:
@@ -184,4 +187,4 @@ class RoomBench:
                 if is_up:
                     self.deliver(peer, frames)
                 elif peer in self.clients:
-                    self.to_client(peer, ag.EdgeMessageReceived(frames))
+                    self.to_client(peer, EdgeMessageReceived(frames))

@@ -13,10 +13,12 @@ from share.config import Config
 from share.mapping.corrections import MapEvent
 from share.net.transport import bind
 from share.protocol import edge_events as ed
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
+from share.timing import PeriodicTimer
 from share.types import Correction
 from share.wire.codec import encode
-from share.wire.messages import peer_id
+from share.wire.messages import Ping, peer_id
 from share.wire.room_messages import Permission
 
 MAP = "ann-1/0"
@@ -44,10 +46,13 @@ class RoomServer:
         self.link.close()
 
     def _serve(self) -> None:
+        ping_timer = PeriodicTimer(1.0)
         while not self._is_ended:
             if (message := self.link.receive(20)) is not None:
                 self._handle(ed.PeerMessageReceived(message.peer, message.frames, permissions=self._allowed))
-            self._handle(ed.EdgeTick())
+            if ping_timer.fire_if_due(time.monotonic_ns()):  # ann is never silent
+                self._handle(ed.PeerMessageReceived(peer_id(1), encode(Ping(0, 0))))
+            self._handle(Tick())
 
     def _handle(self, event: ed.EdgeEvent) -> None:
         for effect in self.edge.handle(event, time.monotonic_ns()):

@@ -16,10 +16,12 @@ from helpers.room_server import MAP, RoomServer
 
 from share import Edge, Room, ShareError
 from share.cli.main import cli
+from share.cli.robot_links import RobotAtEdge, RobotNews
+from share.cli.room_options import open_room
 from share.errors import UsageError
 from share.mapping.map_changes import SaveObject
 from share.net import keys
-from share.protocol.room_events import BridgeSaid, RobotCommanded
+from share.protocol.room_events import MessageWanted, RobotCommanded
 from share.runtime.room_link import RoomLink
 from share.store.map_store import MapStore
 from share.wire.room_messages import Cancel, CommandState, ObjectKind, Permission, RobotPlace, RoomObject
@@ -57,7 +59,7 @@ class Robot:
     def _serve(self) -> None:
         begun: dict[int, float] = {}
         while not self._is_ended:
-            self._link.handle(BridgeSaid(RobotPlace(None, MAP, 1.0, 2.0, 0.0, "")))
+            self._link.handle(MessageWanted(RobotPlace(None, MAP, 1.0, 2.0, 0.0, "")))
             for effect in self._link.step(50):
                 if isinstance(effect, RobotCommanded):
                     command = effect.command
@@ -66,7 +68,7 @@ class Robot:
                     done = isinstance(command, Cancel) or time.monotonic() - began_s > self._reach_s
                     text = "done" if done else "driving"
                     state = CommandState(command.command, None, command.commander, text, done, done)
-                    self._link.handle(BridgeSaid(state))
+                    self._link.handle(MessageWanted(state))
 
 
 def share(*arguments: str) -> object:
@@ -163,6 +165,17 @@ def test_share_robot_over_an_edge(server) -> None:
     far = share("robot", "goto", "99999", "0", *at)
     assert isinstance(far.exception, UsageError)
     assert isinstance(share("robot", "goto", "1", "0", "--edge", server.address).exception, UsageError)
+
+
+def test_share_robot_watch_over_an_edge(server) -> None:
+    with Robot(server.address):
+        seen = RobotAtEdge(open_room(server.address, "ann", None, None, wants_robots=True), "bot").watch()
+        place = next(one for one in seen if one.is_place)
+        seen.close()
+    state = {"pose": [1.0, 2.0, 0.0], "map_id": MAP, "text": ""}
+    assert place == RobotNews(
+        {"robot": "bot", "state": state}, f"bot: x 1.00 y 2.00 m, 0° in {MAP}", is_place=True
+    )
 
 
 def test_a_goto_that_is_interrupted_stops_the_robot(server) -> None:

@@ -16,6 +16,7 @@ from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import RemoveKeyframes, RemoveRun
 from share.mapping.mapper import Mapper
 from share.protocol import edge_events as ed
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
 from share.protocol.peer import restored_runs
 from share.store.map_store import MapStore
@@ -80,7 +81,7 @@ class Session:
             self.tell(run_id, m.Bye())
         self.now_ns += 10 * S
         self.tell(1, m.Ping(0, 0))  # ann is still there
-        self.handle(ed.EdgeTick())
+        self.handle(Tick())
 
     def held(self) -> Counter[str]:
         return Counter(key.agent.partition("-")[0] for key in self.mapper.current_poses().keys)
@@ -150,7 +151,7 @@ def test_a_run_that_returns_before_it_is_removed_continues(tmp_path: Path) -> No
         session.tell(100 + number, step)
         session.handle(ed.MapperResult((), (), (ed.KeyframeKey(gone, 7),)))
         session.tell(100 + number, m.Bye())
-        session.handle(ed.EdgeTick())
+        session.handle(Tick())
         assert gone in session.mapper.report()["agents"]
 
 
@@ -163,7 +164,7 @@ def test_a_run_that_returns_is_reconnected_in_the_file_too(tmp_path: Path) -> No
         key = next(key.agent for key in atlas.all_poses().keys if key.id == 19)
         newer = {(key, k) for k in range(8, 20)}
         session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in newer])
-        session.handle(ed.EdgeTick())
+        session.handle(Tick())
         session.tell(100, hello_of("eve", 100))
         session.tell(
             100, Keyframe(20, 19, 20 * S, at(1.0), 1e-6 * np.eye(6), at(20), np.zeros(3), 0.0, EMPTY, 19)
@@ -191,7 +192,7 @@ def test_a_run_is_removed_after_a_crash_before_its_removal(tmp_path: Path) -> No
         store.write([RemoveKeyframes(keys)])
         second = Session(store, session=8)
         assert gone in second.mapper.report()["agents"]
-        second.handle(ed.EdgeTick())
+        second.handle(Tick())
         assert gone not in second.mapper.report()["agents"]
         assert gone not in {run.run_key for run in store.load().runs}
         store.write([RemoveRun(gone)])  # again: nothing happens
@@ -242,7 +243,7 @@ def emptied(session: Session, run_id: int) -> None:
     atlas, run = session.mapper.atlas, f"eve-{m.public_tag(run_id)[:4]}"
     session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n).agent == run])
     for _ in range(2):
-        session.handle(ed.EdgeTick())
+        session.handle(Tick())
 
 
 def test_a_run_that_returned_stays_the_current_one_of_its_name(tmp_path: Path) -> None:
@@ -270,7 +271,7 @@ def test_the_report_shows_the_run_before_a_removed_one(tmp_path: Path) -> None:
             session.tell(1000 + k, m.Bye())
             session.now_ns += 10 * S
             session.tell(1, m.Ping(0, 0))
-            session.handle(ed.EdgeTick())
+            session.handle(Tick())
         report = session.edge.report(session.mapper.report())
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
 
@@ -292,8 +293,8 @@ def test_a_run_is_removed_only_with_its_last_segment(tmp_path: Path) -> None:
         def leave(ids: range) -> None:
             keys, atlas = {(gone, k) for k in ids}, session.mapper.atlas
             session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in keys])
-            session.handle(ed.EdgeTick())
-            session.handle(ed.EdgeTick())
+            session.handle(Tick())
+            session.handle(Tick())
 
         leave(range(9, 12))
         assert {k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone} == set(range(9))

@@ -15,6 +15,7 @@ from share.errors import UsageError
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.types import Correction, Keyframe, KeyframeCandidate, KeyframeImage, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import WIRE_VERSION, decode, encode, message_bytes
@@ -24,11 +25,11 @@ SESSION = 77
 
 
 def said(effects: Sequence[ev.AgentEffect]) -> list[str]:
-    return [effect.text for effect in effects if isinstance(effect, ev.PrintLine)]
+    return [effect.text for effect in effects if isinstance(effect, PrintLine)]
 
 
 def sent(effects: Sequence[ev.AgentEffect]) -> list[Any]:
-    return [decode(effect.frames) for effect in effects if isinstance(effect, ev.SendToEdge)]
+    return [decode(effect.frames) for effect in effects if isinstance(effect, SendToEdge)]
 
 
 def only(kind: type[T], effects: Sequence[ev.AgentEffect], messages: bool = False) -> list[T]:
@@ -36,7 +37,7 @@ def only(kind: type[T], effects: Sequence[ev.AgentEffect], messages: bool = Fals
 
 
 def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
-    return handle(agent, ev.EdgeMessageReceived(encode(message)), now_ns)
+    return handle(agent, EdgeMessageReceived(encode(message)), now_ns)
 
 
 def welcomed(config: Config | None = None) -> Agent:
@@ -111,7 +112,7 @@ def test_a_refusal_at_the_start_ends_the_run_with_its_reason() -> None:
     agent = Agent(HELLO, Config())
     handle(agent, ev.AgentTick(), 0)
     [fail] = tell(agent, m.Refused("the name is in use"), 1)
-    assert isinstance(fail, ev.FailRun)
+    assert isinstance(fail, FailRun)
     assert isinstance(fail.error, UsageError)
     assert str(fail.error) == "the edge refuses 'ann': the name is in use"
     assert handle(agent, ev.AgentTick(), 2) == []
@@ -133,7 +134,7 @@ def test_bad_messages_are_counted_and_each_kind_is_printed_once() -> None:
     agent = welcomed()
     lines = []
     for frames in ([b"junk"], [b"junk"], [], encode(m.Bye()), encode(m.Bye())):
-        lines += said(handle(agent, ev.EdgeMessageReceived(frames), S))
+        lines += said(handle(agent, EdgeMessageReceived(frames), S))
     assert agent.report()["bad_messages"] == 5
     assert len(lines) == 3
     assert lines[-1] == "the edge sent a Bye, which this agent does not expect"
@@ -142,7 +143,7 @@ def test_bad_messages_are_counted_and_each_kind_is_printed_once() -> None:
 def test_another_wire_version_prints_which_side_to_upgrade() -> None:
     agent = Agent(HELLO, Config())
     newer = b"\x94\x09\x01\x90\x90"
-    assert said(handle(agent, ev.EdgeMessageReceived([newer]), 0)) == [
+    assert said(handle(agent, EdgeMessageReceived([newer]), 0)) == [
         "invalid message from the edge: "
         f"header: peer speaks wire 9, this SHARE wire {WIRE_VERSION}: upgrade the older one"
     ]
@@ -457,7 +458,7 @@ def test_round_trip_and_time_to_the_keyframe_are_reported_smoothed() -> None:
 
 def test_a_correction_of_a_keyframe_resent_to_a_restarted_edge_is_no_latency() -> None:
     agent = corrected_agent()
-    handle(agent, ev.Connected(), 60 * S)
+    handle(agent, Connected(), 60 * S)
     tell(agent, m.Welcome(SESSION + 1, 0), 60 * S)
     tell(agent, m.Ack(1), 60 * S)
     [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(1), 1, answers=0), 60 * S))
@@ -523,15 +524,15 @@ def test_a_keyframe_that_the_link_refuses_does_not_count_as_sent() -> None:
     bytes_up = agent.report()["bytes_up"]
     effects = handle(agent, tracked(0, candidate=True), now)
     while tried < 3:
-        for effect in only(ev.SendToEdge, effects):
+        for effect in only(SendToEdge, effects):
             tried += effect.keyframe_id == 0
-            assert not only(ev.SendToEdge, handle(agent, ev.SendFailed(effect), now))
+            assert not only(SendToEdge, handle(agent, ev.SendFailed(effect), now))
         now += 100 * MS
         effects = tell(agent, m.Ack(0), now)  # it is there, but its queue is full
     told = agent.report()
     assert (told["sent"], told["resent"], told["bytes_up"]) == (0, 0, bytes_up)
     assert (told["keyframes"], told["unacknowledged"]) == (1, 1)
-    while not (keyframes := [s for s in only(ev.SendToEdge, effects) if s.keyframe_id == 0]):
+    while not (keyframes := [s for s in only(SendToEdge, effects) if s.keyframe_id == 0]):
         now += 100 * MS
         effects = tell(agent, m.Ack(0), now)
     told = agent.report()

@@ -11,8 +11,9 @@ from helpers.model_edge import MS, S
 
 from share.config import Config
 from share.protocol.agent_health import PoseAges, agent_troubles, trouble_lines
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
-from share.protocol.edge_events import EdgeTick, PeerMessageReceived
+from share.protocol.edge_events import PeerMessageReceived
 from share.types import AgentKind, TrackState
 from share.wire import messages as wire
 from share.wire.codec import encode
@@ -112,5 +113,5 @@ def test_a_place_that_is_off_is_trouble() -> None:
 
 def test_who_left_is_in_no_trouble() -> None:
     edge = edge_with(wire.Status(TrackState.LOST, 3.0, "lost for 1 s"), wire.Bye())
-    edge.handle(EdgeTick(), 60 * S)
+    edge.handle(Tick(), 60 * S)
     assert trouble_lines(edge.report({})["agents"]) == [] and edge.latest_poses() == {}

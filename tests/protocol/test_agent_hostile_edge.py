@@ -13,6 +13,7 @@ from share.config import Config
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import EdgeMessageReceived, PrintLine, SendToEdge
 from share.types import Correction, Keyframe
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -36,7 +37,7 @@ def odometry(effects: list[ev.AgentEffect]) -> list[tuple[int, int, bytes]]:
 
 
 def messages(effects: list[ev.AgentEffect]) -> list[m.Message]:
-    return [decode(effect.frames) for effect in effects if isinstance(effect, ev.SendToEdge)]
+    return [decode(effect.frames) for effect in effects if isinstance(effect, SendToEdge)]
 
 
 def alone(frames: list[ev.FrameTracked]) -> list[tuple[int, int, bytes]]:
@@ -48,7 +49,7 @@ def lied_to(agent: Agent, frames: list[ev.FrameTracked], liar: Liar, each: int) 
     """Effects of frames, with so many false messages between each two of them."""
     effects: list[ev.AgentEffect] = []
     for frame in frames:
-        news = [frame, *(ev.EdgeMessageReceived(liar.say()) for _ in range(each)), ev.AgentTick()]
+        news = [frame, *(EdgeMessageReceived(liar.say()) for _ in range(each)), ev.AgentTick()]
         for event in news:
             more = handle(agent, event, frame.done_ns)
             for message in messages(more):
@@ -75,7 +76,7 @@ def test_odometry_does_not_depend_on_a_hostile_edge(seed: int) -> None:
         now = frames[299].done_ns + (k + 1) * FRAME_MS * MS
         more = handle(agent, event, now)
         for answer in down if k > 80 else ():
-            more += handle(agent, ev.EdgeMessageReceived(encode(answer)), now)
+            more += handle(agent, EdgeMessageReceived(encode(answer)), now)
         down = [answer for message in messages(more) for answer in edge.receive(message, now)]
         effects += more
     assert odometry(effects) == alone(frames)
@@ -84,7 +85,7 @@ def test_odometry_does_not_depend_on_a_hostile_edge(seed: int) -> None:
     assert edge.applied[-1].id == report["keyframes"] - 1
     assert report["map_id"] == f"map-{edge.session}"
     assert report["bad_messages"] > 100
-    said = [e.text for e in effects[:lies] if isinstance(e, ev.PrintLine)]
+    said = [e.text for e in effects[:lies] if isinstance(e, PrintLine)]
     assert all(line.isprintable() and len(line) < 400 for line in said)
     assert 3 < len(said) < 30
 
@@ -120,11 +121,11 @@ def welcomed(frames: int = 0) -> tuple[Agent, int]:
 
 
 def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
-    return handle(agent, ev.EdgeMessageReceived(encode(message)), now_ns)
+    return handle(agent, EdgeMessageReceived(encode(message)), now_ns)
 
 
 def said(effects: list[ev.AgentEffect]) -> list[str]:
-    return [effect.text for effect in effects if isinstance(effect, ev.PrintLine)]
+    return [effect.text for effect in effects if isinstance(effect, PrintLine)]
 
 
 def test_a_welcome_beyond_what_was_sent_is_ignored() -> None:

@@ -15,6 +15,7 @@ from share.config import AgentConfig, Config
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import PrintLine
 from share.types import Keyframe
 
 FRAMES = 240  # 12 s at 20 Hz
@@ -165,7 +166,7 @@ def test_an_edge_without_map_is_sent_all_kept_keyframes() -> None:
         run.step(frame.done_ns, frame)
     assert [k.id for k in second.applied[:held]] == list(range(held))
     check_applied(second.applied, walk)
-    lines = [effect.text for effect in run.effects if isinstance(effect, ev.PrintLine)]
+    lines = [effect.text for effect in run.effects if isinstance(effect, PrintLine)]
     assert lines[0] == "connected to the edge"
     assert lines[1].startswith("the edge has restarted; ")
 

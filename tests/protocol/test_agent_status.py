@@ -10,6 +10,7 @@ from helpers.model_edge import HELLO, MS, S, tracked
 from share.config import Config
 from share.protocol import agent_events as ev
 from share.protocol.agent import Agent
+from share.protocol.common_events import EdgeMessageReceived, SendToEdge
 from share.types import TrackState, WaitReason
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -29,11 +30,11 @@ def agent_with(frames: int, ms: float = 4.0) -> tuple[Agent, int]:
 
 def heard_again(agent: Agent, now_ns: int) -> None:
     """Connect the agent."""
-    agent.handle(ev.EdgeMessageReceived(encode(m.Welcome(1, 0))), now_ns)
+    agent.handle(EdgeMessageReceived(encode(m.Welcome(1, 0))), now_ns)
 
 
 def said(effects: list[ev.AgentEffect]) -> list[m.Status]:
-    messages = [decode(effect.frames) for effect in effects if isinstance(effect, ev.SendToEdge)]
+    messages = [decode(effect.frames) for effect in effects if isinstance(effect, SendToEdge)]
     return [message for message in messages if isinstance(message, m.Status)]
 
 

@@ -22,6 +22,7 @@ from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
+from share.protocol.common_events import PrintLine, Tick
 from share.protocol.edge import Edge
 from share.scheduling.policies import POLICIES
 from share.types import AgentKind
@@ -126,7 +127,7 @@ def test_an_edge_without_map_gets_the_keyframes_again_and_merges_again(joined):
     assert [a["keyframes"] for a in report["agents"].values()] == [44, 44]
     assert len(report["maps"]) == 1
     assert {again.event(ev.LocalisedPose, n)[-1].map_id for n in ("ann", "bob")} == set(report["maps"])
-    said = [e.text for e in again.event(ev.PrintLine, "ann")]
+    said = [e.text for e in again.event(PrintLine, "ann")]
     assert sum("restarted" in text for text in said) == 1
 
 
@@ -194,8 +195,8 @@ def test_the_mapper_gets_the_presence_of_runs():
         [e.is_present for e in effects if isinstance(e, ed.SetPresence)]
         for effects in (
             tell(edge, 1, m.Ping(1, 1), 100),
-            edge.handle(ed.EdgeTick(), 3500 * MS),
-            edge.handle(ed.EdgeTick(), 3600 * MS),
+            edge.handle(Tick(), 3500 * MS),
+            edge.handle(Tick(), 3600 * MS),
             tell(edge, 1, m.Ping(2, 2), 4000),
             tell(edge, 1, m.Bye(), 4100),
         )

@@ -17,6 +17,7 @@ from share.mapping.steps import QueryStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
+from share.protocol.common_events import Connected, EdgeMessageReceived, PrintLine, SendToEdge
 from share.protocol.edge import Edge
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
@@ -44,7 +45,7 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
 
 def sent(effects: list, kind: type) -> list:
     messages = [
-        decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, (ed.SendToPeer, ev.SendToEdge))
+        decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, (ed.SendToPeer, SendToEdge))
     ]
     return [message for message in messages if isinstance(message, kind)]
 
@@ -157,14 +158,14 @@ def test_ten_thousand_keyframes_at_once_are_bounded():
 def test_a_hello_is_sent_at_once_when_the_link_is_back():
     """A new session of the edge is known by its welcome, not only by the answer to the next ping."""
     agent, edge = Agent(HELLO, Config()), Edge(Config(), 7)
-    hello = agent.handle(ev.Connected(), 0)
+    hello = agent.handle(Connected(), 0)
     assert sent(hello, m.Hello)
     (welcome,) = sent(tell(edge, HELLO), m.Welcome)
-    agent.handle(ev.EdgeMessageReceived(encode(welcome)), 1)
+    agent.handle(EdgeMessageReceived(encode(welcome)), 1)
     assert not sent(agent.handle(ev.AgentTick(), 2), m.Hello)
-    assert sent(agent.handle(ev.Connected(), 3), m.Hello)
-    effects = agent.handle(ev.EdgeMessageReceived(encode(m.Welcome(8, 0))), 4)
-    assert any("restarted" in e.text for e in effects if isinstance(e, ev.PrintLine))
+    assert sent(agent.handle(Connected(), 3), m.Hello)
+    effects = agent.handle(EdgeMessageReceived(encode(m.Welcome(8, 0))), 4)
+    assert any("restarted" in e.text for e in effects if isinstance(e, PrintLine))
 
 
 def test_the_newest_correction_comes_with_the_welcome():

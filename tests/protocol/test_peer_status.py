@@ -7,8 +7,9 @@ from helpers.hellos import hello_of
 from helpers.model_edge import MS, S
 
 from share.config import Config
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
-from share.protocol.edge_events import EdgeTick, PeerMessageReceived
+from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import PeerStatus, RestoredRun
 from share.types import TrackState
@@ -54,7 +55,7 @@ def test_a_restored_run_has_no_age() -> None:
     """The machine has run for long before the edge starts."""
     known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)))
     edge = Edge(Config(), session=5, restored=[known])
-    edge.handle(EdgeTick(), 6600 * S)
+    edge.handle(Tick(), 6600 * S)
     seen = shown(edge)
     assert (seen["state"], seen["last_received_s"], seen["gone"]) == ("SILENT", None, True)
     assert "no message since" in str(seen["reason"])
@@ -75,10 +76,10 @@ def shown(edge: Edge) -> dict[str, object]:
 
 def test_a_silent_agent_is_shown_as_silent() -> None:
     edge = edge_with(OK, S)
-    edge.handle(EdgeTick(), S + 650 * MS)
+    edge.handle(Tick(), S + 650 * MS)
     assert (shown(edge)["state"], shown(edge)["reason"]) == ("OK", "")
     for at_s in (1.75, 3.3, 60.0):  # and after it was taken as gone
-        edge.handle(EdgeTick(), round(at_s * S))
+        edge.handle(Tick(), round(at_s * S))
         assert shown(edge)["state"] == "SILENT"
         assert shown(edge)["reason"] == f"silent for {at_s - 1:.1f} s; its last state was OK"
         assert shown(edge)["pose_age_ms"] == round(20 + (at_s - 1) * 1000, 1)
@@ -89,5 +90,5 @@ def test_a_silent_agent_is_shown_as_silent() -> None:
 def test_an_agent_that_left_keeps_its_last_state() -> None:
     edge = edge_with(OK, S)
     edge.handle(PeerMessageReceived(wire.peer_id(1), encode(wire.Bye())), 2 * S)
-    edge.handle(EdgeTick(), 60 * S)
+    edge.handle(Tick(), 60 * S)
     assert (shown(edge)["state"], shown(edge)["gone"]) == ("OK", True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.room_bench import Air, RoomBench, at
 
-from share.protocol import agent_events as ag
 from share.protocol import room_events as ev
+from share.protocol.common_events import EdgeMessageReceived
 from share.protocol.room_objects import MAX_OBJECTS, MAX_OWNED
 from share.wire import room_messages as room
 from share.wire.codec import encode
@@ -55,7 +55,7 @@ def test_another_may_move_it_and_remove_it_and_the_owner_stays(bench) -> None:
     bench.run(0.1)
     assert positions(bench, bench.ann) == {7: (3, 4, 0)}
     assert bench.clients[bench.ann].objects[7].owner == "ann"
-    bench.to_client(bench.bob, ev.RequestWanted(room.RemoveObject(2, 7)))
+    bench.to_client(bench.bob, ev.MessageWanted(room.RemoveObject(2, 7)))
     bench.run(0.1)
     assert positions(bench, bench.ann) == {}
     assert bench.of(bench.ann, ev.ObjectChanged)[-1].changed.removed == "removed by 'bob'"
@@ -79,7 +79,7 @@ def test_loss_doubles_and_disorder_heal(seed: int) -> None:
     for request in range(1, 120):
         object_id = int(rng.integers(5))
         if rng.random() < 0.1 and object_id in last:
-            bench.to_client(bench.ann, ev.RequestWanted(room.RemoveObject(request, object_id)))
+            bench.to_client(bench.ann, ev.MessageWanted(room.RemoveObject(request, object_id)))
             del last[object_id]
         else:
             last[object_id] = (float(request), 0.0, 0.0)
@@ -87,10 +87,8 @@ def test_loss_doubles_and_disorder_heal(seed: int) -> None:
         bench.run(0.06)
     bench.run(12)
     assert positions(bench, bench.ann) == last == positions(bench, bench.bob)
-    held = {
-        n: tuple(one.object.T_map_object[:3, 3]) for n, one in bench.edge.room._objects.objects._kept.items()
-    }
-    assert held == last
+    kept = [one.object for one in bench.edge.room.kept_objects()]
+    assert {one.object_id: tuple(one.T_map_object[:3, 3]) for one in kept} == last
     # a removal whose put was lost, and that took its place, finds nothing
     assert all(not one or one.startswith("there is no object") for one in answers(bench, bench.ann).values())
 
@@ -145,7 +143,7 @@ def test_objects_and_open_requests_survive_a_restart_of_the_edge(has_store: bool
     bench.run(0.1)
     bench.air.loss = 1.0
     bench.put(bench.ann, 3, 9, at(3, 3), MAP)
-    bench.to_client(bench.bob, ev.RequestWanted(room.RemoveObject(1, 8)))
+    bench.to_client(bench.bob, ev.MessageWanted(room.RemoveObject(1, 8)))
     bench.run(0.1)
     bench.restart_edge()
     bench.air.loss = 0.0
@@ -158,8 +156,8 @@ def test_objects_and_open_requests_survive_a_restart_of_the_edge(has_store: bool
 def test_a_removal_that_the_dead_edge_had_done_counts_as_done(bench) -> None:
     bench.put(bench.ann, 1, 7, at(1, 2), MAP)
     bench.run(0.1)
-    bench.to_client(bench.ann, ev.RequestWanted(room.RemoveObject(2, 7)))
-    bench._pass_on()
+    bench.to_client(bench.ann, ev.MessageWanted(room.RemoveObject(2, 7)))
+    bench.pass_on()
     bench.under_way.clear()  # the receipt is lost
     bench.restart_edge()
     bench.run(5)
@@ -171,7 +169,7 @@ def test_a_client_that_was_away_sees_what_there_is(bench) -> None:
     bench.put(bench.ann, 2, 8, at(1, 2), MAP)
     bench.run(0.5)
     away = bench.clients.pop(bench.bob)
-    bench.to_client(bench.ann, ev.RequestWanted(room.RemoveObject(3, 7)))
+    bench.to_client(bench.ann, ev.MessageWanted(room.RemoveObject(3, 7)))
     bench.run(70)  # the removal is no longer listed
     bench.clients[bench.bob] = away
     bench.run(3)
@@ -192,7 +190,7 @@ def test_a_client_that_the_edge_forgot_without_its_knowing_joins_again(bench) ->
     send, bench.deliver = bench.deliver, lambda peer, frames: None  # only the way up is broken
     for _ in range(35):
         bench.run(0.1)
-        bench.to_client(bench.ann, ag.EdgeMessageReceived(encode(room.ObjectList(7, 0))))
+        bench.to_client(bench.ann, EdgeMessageReceived(encode(room.ObjectList(7, 0))))
     bench.deliver = send
     assert bench.edge.room.clients.get(bench.ann) is None and bench.clients[bench.ann].is_connected
     bench.run(2)
@@ -239,15 +237,15 @@ def test_an_owner_and_the_room_have_their_limits(bench) -> None:
     for n in range(MAX_OWNED + 1):
         bench.said(bench.ann, room.PutObject(n, n, ObjectKind.CUBE, MAP, at(0, 0)))
         bench.now_ns += 10**8
-    assert len(bench.edge.room._objects.objects) == MAX_OWNED
+    assert len(bench.edge.room.kept_objects()) == MAX_OWNED
     for k in range(5):
         peer = bench.client(f"c{k}", 100 + k)
-        bench._pass_on()
+        bench.pass_on()
         for n in range(MAX_OWNED):
             bench.said(peer, room.PutObject(n, 100 * (k + 1) + n, ObjectKind.CUBE, MAP, at(0, 0)))
             bench.now_ns += 10**8
         bench.to_client(peer, ev.ClientEnded())
-    assert len(bench.edge.room._objects.objects) == MAX_OBJECTS
+    assert len(bench.edge.room.kept_objects()) == MAX_OBJECTS
 
 
 def test_too_many_requests_are_neither_taken_nor_answered_and_come_again(bench) -> None:
@@ -266,7 +264,7 @@ def test_too_many_requests_are_neither_taken_nor_answered_and_come_again(bench) 
 def two_maps() -> tuple[RoomBench, str, str]:
     """ann and bob, each in a map of its own, with an object each."""
     bench = prepared(RoomBench())
-    ann = next(run.key for run in bench.edge.room._runs.present())
+    ann = bench.run_key("ann")
     bob = bench.agent("bob", 2)
     bench.correct(bob, "bob-2/0", np.eye(4))
     bench.put(bench.ann, 1, 1, at(1, 0), MAP)

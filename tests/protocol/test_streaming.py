@@ -16,6 +16,7 @@ from share.geometry.camera import Camera, Rig
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
+from share.protocol.common_events import EdgeMessageReceived, FailRun, PrintLine, SendToEdge, Tick
 from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
 from share.protocol.streaming import FrameStreamer, StreamingAgent
@@ -65,7 +66,7 @@ class Wire:
                 what()
             if self.now_ms % 50 == 0:
                 self.to_agent(ev.AgentTick())
-                self.to_edge(ed.EdgeTick())
+                self.to_edge(Tick())
             self.now_ms += 1
 
     def to_agent(self, event: ev.AgentEvent) -> None:
@@ -73,7 +74,7 @@ class Wire:
             self.effects.append(effect)
             if isinstance(effect, ev.SendFrameToEdge) and not self.takes:
                 self.to_agent(ev.SendFailed(effect))
-            elif isinstance(effect, ev.SendToEdge | ev.SendFrameToEdge) and not self.cut:
+            elif isinstance(effect, SendToEdge | ev.SendFrameToEdge) and not self.cut:
                 copy = [bytes(part) for part in effect.frames]
                 self.later(1, lambda copy=copy: self.to_edge(ed.PeerMessageReceived(PEER, copy)))
 
@@ -82,7 +83,7 @@ class Wire:
             match effect:
                 case ed.SendToPeer() if not self.cut:
                     copy = [bytes(part) for part in effect.frames]
-                    self.later(1, lambda copy=copy: self.to_agent(ev.EdgeMessageReceived(copy)))
+                    self.later(1, lambda copy=copy: self.to_agent(EdgeMessageReceived(copy)))
                 case ed.WriteEvent():
                     self.told.append(effect.fields)
                 case ed.StartTracker():
@@ -120,7 +121,7 @@ class Wire:
 
     @property
     def said(self) -> list[str]:
-        return [effect.text for effect in self.of(ev.PrintLine)]
+        return [effect.text for effect in self.of(PrintLine)]
 
 
 def joined(**more: float) -> Wire:
@@ -241,7 +242,7 @@ def test_an_agent_whose_tracker_cannot_start_is_refused() -> None:
     wire.run(100)
     wire.to_edge(ed.TrackerLost(wire.trackers[0].key, 0, "ended with exit code 1"))
     wire.run(200)
-    (fail,) = wire.of(ev.FailRun)
+    (fail,) = wire.of(FailRun)
     assert isinstance(fail.error, UsageError)
     assert "its tracking process ended with exit code 1" in str(fail.error)
     assert len(wire.trackers) == 1
@@ -275,7 +276,7 @@ def test_an_agent_of_the_other_mode_is_refused(edge: Edge, streams: bool, said: 
         agent=(StreamingAgent if streams else Agent)(replace(HELLO, streams_frames=streams), CONFIG),
     )
     wire.run(200)
-    (fail,) = wire.of(ev.FailRun)
+    (fail,) = wire.of(FailRun)
     assert said in str(fail.error)
     assert not wire.trackers
 
@@ -299,9 +300,9 @@ def test_unexpected_messages_change_nothing() -> None:
     assert report["agents"]["ann"]["unexpected"] == report["unjoined"]["unexpected"] == 1
     alone = Agent(hello_of("bob", 8), Config())
     effects = alone.handle(
-        ev.EdgeMessageReceived(encoded(m.RemoteTrackingResult(0, 0, TrackState.LOST, None))), 0
+        EdgeMessageReceived(encoded(m.RemoteTrackingResult(0, 0, TrackState.LOST, None))), 0
     )
-    assert [e.text for e in effects if isinstance(e, ev.PrintLine)] == [
+    assert [e.text for e in effects if isinstance(e, PrintLine)] == [
         "the edge sent a RemoteTrackingResult, which this agent does not expect"
     ]
 

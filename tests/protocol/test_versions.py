@@ -16,6 +16,7 @@ from share.errors import VersionError
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
+from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.protocol.edge import Edge
 from share.protocol.remote_tracking import TrackingEdge
 from share.protocol.streaming import StreamingAgent
@@ -116,19 +117,19 @@ class OlderEdge:
 
 def run(agent: Agent, edge: OlderEdge | None, seconds: int) -> list[ev.AgentEffect]:
     """Run at ten frames a second; answers arrive at the next frame."""
-    effects = agent.handle(ev.Connected(), 0)
+    effects = agent.handle(Connected(), 0)
     inbox: list[list[bytes]] = []
     for k in range(10 * seconds):
-        for event in (frame(k), ev.AgentTick(), *map(ev.EdgeMessageReceived, inbox)):
+        for event in (frame(k), ev.AgentTick(), *map(EdgeMessageReceived, inbox)):
             effects += agent.handle(event, k * S // 10)
-        sent = [[bytes(f) for f in e.frames] for e in effects if isinstance(e, ev.SendToEdge)]
-        effects = [e for e in effects if not isinstance(e, ev.SendToEdge)]
+        sent = [[bytes(f) for f in e.frames] for e in effects if isinstance(e, SendToEdge)]
+        effects = [e for e in effects if not isinstance(e, SendToEdge)]
         inbox = [a for frames in sent if edge and (a := edge.answer(frames, k * S // 10)) is not None]
     return effects
 
 
 def said(effects: list[ev.AgentEffect]) -> list[str]:
-    return [effect.text for effect in effects if isinstance(effect, ev.PrintLine)]
+    return [effect.text for effect in effects if isinstance(effect, PrintLine)]
 
 
 def poses(effects: list[ev.AgentEffect]) -> list[ev.LocalisedPose]:
@@ -154,18 +155,18 @@ def test_an_agent_joins_once_the_edge_is_upgraded(old: int) -> None:
     agent = Agent(HELLO, Config())
     run(agent, OlderEdge(old), 5)
     welcome = [bytes(f) for f in encode(m.Welcome(8, 0))]
-    assert said(agent.handle(ev.EdgeMessageReceived(welcome), 6 * S)) == ["connected to the edge"]
+    assert said(agent.handle(EdgeMessageReceived(welcome), 6 * S)) == ["connected to the edge"]
     assert agent.is_connected
 
 
 def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None:
     """An edge that starts trackers is slow to welcome: pings of older versions reach it before."""
     agent, edge, answers = StreamingAgent(replace(HELLO, streams_frames=True), Config()), edges()[1], []
-    agent.handle(ev.Connected(), 0)
+    agent.handle(Connected(), 0)
     for k in range(100):
         now_ns = k * S // 10
         for effect in agent.handle(ev.AgentTick(), now_ns):
-            if isinstance(effect, ev.SendToEdge):
+            if isinstance(effect, SendToEdge):
                 received = ed.PeerMessageReceived(m.peer_id(HELLO.run_id), [bytes(f) for f in effect.frames])
                 answers += sends(edge.handle(received, now_ns))
     assert edge.report({})["unjoined"]["other_version"] >= 30
@@ -177,9 +178,9 @@ def test_messages_of_an_older_edge_change_nothing(old: int) -> None:
     effects = run(agent, None, 5)
     downs = [message for message in traffic(old) if message.way == "down"]
     for message in downs:
-        effects += agent.handle(ev.EdgeMessageReceived(message.frames), 5 * S)
+        effects += agent.handle(EdgeMessageReceived(message.frames), 5 * S)
     assert not [
-        effect for effect in effects if isinstance(effect, (ev.FailRun, ev.CloseLink, ev.CorrectionApplied))
+        effect for effect in effects if isinstance(effect, (FailRun, ev.CloseLink, ev.CorrectionApplied))
     ]
     report = agent.report()
     assert (report["connected"], report["corrections"], report["map_id"]) == (False, 0, None)

@@ -7,11 +7,11 @@ import pytest
 from helpers.robot_drive import SECOND, UNIX_NS, RobotDrive, solid
 
 from share.geometry.se3 import from_rt, so3_exp
+from share.protocol.common_events import PrintLine
 from share.robot import robot_events as ev
-from share.robot.area import DrivingArea
 from share.robot.bridge import LEAD_S
 from share.robot.planar import PlanarPose, flattened
-from share.robot.settings import RobotSettings
+from share.robot.settings import DrivingArea, RobotSettings
 from share.types import TrackState
 
 
@@ -74,7 +74,7 @@ def test_a_late_datagram_is_ignored_and_an_agent_begun_anew_is_not(drive: RobotD
     assert np.hypot(*np.subtract(drive.bridge.report(drive.now_ns)["pose"], before)[:2]) < 0.1
     drive.sequence, drive.is_tracked = -1, True
     drive.sequence -= 500
-    assert not [e for e in drive.run(1.0) if isinstance(e, ev.BridgeLine)]
+    assert not [e for e in drive.run(1.0) if isinstance(e, PrintLine)]
 
 
 def test_poses_of_another_agent_move_nothing(drive: RobotDrive) -> None:
@@ -148,7 +148,7 @@ def test_without_a_place_the_robot_stops_and_tf_too(drive: RobotDrive, fault, te
     fault(drive)
     drive.run(0.7)
     assert stopped_for(drive, text)
-    lines = [line.text for line in drive.of(ev.BridgeLine) if text in line.text]
+    lines = [line.text for line in drive.of(PrintLine) if text in line.text]
     assert len(lines) == 2  # the robot is stopped, and there is no map → odom; each once
     assert not [e for e in drive.run(0.5) if isinstance(e, ev.PublishMapOdom)]
     drive.goals = []

@@ -52,12 +52,12 @@ class WiredRobot:
             lambda: self.drive.bridge.report(self.drive.now_ns), self.bench.now_ns
         )
         if place is not None:
-            self.bench.to_client(BOT, ce.BridgeSaid(place))
+            self.bench.to_client(BOT, ce.MessageWanted(place))
         self._navigate()
 
     def _carry_out(self, events: list[ev.RobotEvent], states: list[room.CommandState]) -> None:
         for state in states:
-            self.bench.to_client(BOT, ce.BridgeSaid(state))
+            self.bench.to_client(BOT, ce.MessageWanted(state))
         for event in events:
             self.handle(event)
 
@@ -71,7 +71,7 @@ class WiredRobot:
         if isinstance(effect, ev.GoalReport):
             state = self.commands.report(effect, self.bench.now_ns)
             if state is not None:
-                self.bench.to_client(BOT, ce.BridgeSaid(state))
+                self.bench.to_client(BOT, ce.MessageWanted(state))
         elif isinstance(effect, ev.SendGoal):
             self.accepted.append(effect.goal_id)
 
@@ -99,10 +99,10 @@ class WiredRobot:
 
     def goto(self, peer: bytes, command: int, x: float = 2.0, **more: object) -> None:
         goal = room.Goto(command, "bot", "", None, x, -1.0, 0.5)
-        self.bench.to_client(peer, ce.CommandWanted(replace(goal, **more)))
+        self.bench.to_client(peer, ce.MessageWanted(replace(goal, **more)))
 
     def cancel(self, peer: bytes, command: int) -> None:
-        self.bench.to_client(peer, ce.CommandWanted(room.Cancel(command, "bot")))
+        self.bench.to_client(peer, ce.MessageWanted(room.Cancel(command, "bot")))
 
     def last(self, peer: bytes, command: int) -> room.CommandState:
         states = [one.state for one in self.bench.of(peer, ce.CommandChanged) if one.state.command == command]
@@ -353,7 +353,7 @@ def test_without_any_answer_a_command_ends() -> None:
     bench = RoomBench()
     ann = bench.client("ann", 31)
     bench.air.loss = 1.0
-    bench.to_client(ann, ce.CommandWanted(room.Goto(1, "bot", "", None, 2.0, -1.0)))
+    bench.to_client(ann, ce.MessageWanted(room.Goto(1, "bot", "", None, 2.0, -1.0)))
     bench.run(11)
     (state,) = [one.state for one in bench.of(ann, ce.CommandChanged)]
     assert state.is_final and state.text == "no edge answers"

@@ -32,6 +32,7 @@ from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.steps import SolveStep
 from share.protocol import edge_events as ed
+from share.protocol.common_events import Tick
 from share.protocol.edge import Edge
 from share.types import F64, AgentKind, Keyframe, KeyframeImage, View
 from share.vision import corners
@@ -77,7 +78,7 @@ class InnerEdge:
 
     def tick(self, ns: int) -> None:
         self.now_ns += ns
-        self._carry_out(self.edge.handle(ed.EdgeTick(), self.now_ns))
+        self._carry_out(self.edge.handle(Tick(), self.now_ns))
 
     def work(self, most: int = 200) -> None:
         """The steps that are due."""

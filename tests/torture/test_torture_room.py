@@ -10,9 +10,8 @@ from corpus import KINDS, _made_up
 from helpers.room_bench import RoomBench
 from mutations import mutate
 
-from share.protocol import agent_events as ag
-from share.protocol import edge_events as ed
 from share.protocol import room_events as ev
+from share.protocol.common_events import EdgeMessageReceived, Tick
 from share.protocol.room_objects import MAX_OBJECTS
 from share.wire import room_messages as room
 from share.wire.codec import WIRE_VERSION
@@ -46,7 +45,7 @@ def attack(bench: RoomBench, draw: random.Random, kinds: list[str], count: int) 
         if k % 10 == 0:
             bench.now_ns += 20_000_000
             bench.under_way.clear()
-            bench.to_edge(ed.EdgeTick())
+            bench.to_edge(Tick())
 
 
 @pytest.mark.parametrize("permissions", [frozenset(), frozenset(Permission)], ids=["may nothing", "may all"])
@@ -77,13 +76,13 @@ def test_mutated_messages_of_an_edge_end_no_client() -> None:
     bench = prepared(frozenset(Permission))
     draw, made = random.Random(SEED), _made_up(WIRE_VERSION)
     machine = bench.clients[bench.ann]
-    machine.handle(ev.RequestWanted(room.RemoveObject(9, 3)), bench.now_ns)
+    machine.handle(ev.MessageWanted(room.RemoveObject(9, 3)), bench.now_ns)
     for k in range(COUNT):
         kind = draw.choice([*DOWN, "receipt", "object", "objects"])
-        machine.handle(ag.EdgeMessageReceived(mutate(draw, made[kind])), bench.now_ns)
+        machine.handle(EdgeMessageReceived(mutate(draw, made[kind])), bench.now_ns)
         if k % 10 == 0:
             bench.now_ns += 20_000_000
-            machine.handle(ev.ClientTick(), bench.now_ns)
+            machine.handle(Tick(), bench.now_ns)
     assert len(machine.objects) <= 2 * 128
     bench.run(5)
     bench.put(bench.ann, 10, 4242, np.eye(4), MAP)

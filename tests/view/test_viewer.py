@@ -152,16 +152,21 @@ def soon(is_true: Callable[[], bool], within_s: float = 20.0) -> bool:
     return found
 
 
+def show_and_look(room: LiveRoom) -> int:
+    """Show an agent, wait until a browser has it, and return the process id of the viewer."""
+    show_agent(room)
+    with browser(room.endpoint) as connection:
+        assert seen(connection, "/points/0/0")
+    assert room.pid is not None
+    return room.pid
+
+
 @needs_viser
 @pytest.mark.long
 def test_a_killed_viewer_is_reaped_told_and_started_again() -> None:
     told: list[str] = []
     with closing(LiveRoom("0", None, "test", told.append)) as room:
-        show_agent(room)
-        with browser(room.endpoint) as connection:
-            assert seen(connection, "/points/0/0")
-        pid = room.pid
-        assert pid is not None
+        pid = show_and_look(room)
         os.kill(pid, signal.SIGKILL)
         assert soon(lambda: not room.is_alive)
         assert soon(lambda: not Path(f"/proc/{pid}").exists())  # no zombie
@@ -187,11 +192,7 @@ def test_a_viewer_that_hangs_is_killed_told_and_started_again(monkeypatch: pytes
     """Whoever feeds it never waits, though the pipe is full."""
     told: list[str] = []
     with closing(LiveRoom("0", None, "test", told.append)) as room:
-        show_agent(room)
-        with browser(room.endpoint) as connection:
-            assert seen(connection, "/points/0/0")
-        pid = room.pid
-        assert pid is not None
+        pid = show_and_look(room)
         os.kill(pid, signal.SIGSTOP)
         for stamp_ns in range(20_000):
             room.feed.add_event(ev.PoseArrived("ann-1", TrackState.OK, 0, np.eye(4), float(stamp_ns)))

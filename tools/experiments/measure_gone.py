@@ -2,7 +2,7 @@
 
     python tools/experiments/measure_gone.py 5101-0 5101-1 [FIRST SECOND …] [--json FILE]
 
-FIRST and SECOND: days of one emulated room, as for `measure_next_day.py`, which plays them. Prints a Markdown
+FIRST and SECOND: days of one emulated room, played as `measure_next_day.py` does. Prints a Markdown
 table with two lines a pair: keyframes of the first day that stayed in the map, and those that left.
 
 Protocol: rays through a grid of pixels of each keyframe of the first day, from its true pose, meet the room
@@ -14,12 +14,9 @@ they may leave.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from share import startup
@@ -27,9 +24,9 @@ from share import startup
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
-from measure_next_day import play  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
-from tool_main import exit_code, line  # noqa: E402
+from tool_main import exit_code  # noqa: E402
+from two_days import play_days, run_pairs  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
@@ -44,7 +41,6 @@ from share.mapping.loops import KeyframeKey  # noqa: E402
 from share.mapping.map_changes import StoredMap  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.recordings.trajectory import read_tum  # noqa: E402
-from share.store.map_store import MapStore  # noqa: E402
 from share.types import F64  # noqa: E402
 
 _GRID = 40, 30  # rays of a picture
@@ -133,13 +129,7 @@ def true_views(session: Session, kept: StoredMap, known: Sequence[KeyframeKey] =
 def measure(first: Path, second: Path) -> list[Leavers]:
     """Play both days; return what stayed and what left."""
     days = read_session(first), read_session(second)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "room.sqlite"
-        kept = []
-        for session, first_run in zip(days, (1, 101), strict=True):
-            with MapStore.open(path) as store:
-                play(session, store, first_run)
-                kept.append(store.load())
+    *kept, _ = play_days(*days)
     old = true_views(days[0], kept[0])
     new = true_views(days[1], kept[1], [one.keyframe_key for one in kept[0].keyframes])
     left = {one.keyframe_key for one in kept[0].keyframes} - {one.keyframe_key for one in kept[1].keyframes}
@@ -196,25 +186,5 @@ def _count_in_place(old: Sequence[TrueView], new: Sequence[TrueView]) -> int:
 _TITLES = "sessions", "keyframes", "count", "in place", "gone", "hidden", "there", "of it shown today"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("sessions", nargs="+", type=Path, metavar="FIRST SECOND")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args()
-    if len(options.sessions) % 2:
-        raise UsageError("give pairs of sessions: FIRST SECOND")
-    print(line(_TITLES), line(["---"] * len(_TITLES)), sep="\n", flush=True)
-    results = []
-    for first, second in zip(options.sessions[::2], options.sessions[1::2], strict=True):
-        for one in measure(first, second):
-            results.append(one)
-            cells = [f"{x:.2f}" if isinstance(x, float) else str(x) for x in asdict(one).values()]
-            print(line(cells), flush=True)
-    if options.json:
-        options.json.write_text(json.dumps([asdict(one) for one in results], indent=2))
-
-
 if __name__ == "__main__":
-    sys.exit(exit_code("measure_gone", main))
+    sys.exit(exit_code("measure_gone", lambda: run_pairs(__doc__ or "", _TITLES, measure)))

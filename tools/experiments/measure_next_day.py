@@ -15,12 +15,9 @@ error is that of each pose in a saved map under that map's alignment, *wrong* be
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from share import startup
@@ -28,27 +25,19 @@ from share import startup
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
-from tool_main import exit_code, line  # noqa: E402
+from tool_main import exit_code  # noqa: E402
+from two_days import play_days, run_pairs  # noqa: E402
 
-from share.config import Config  # noqa: E402
-from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.interpolation import associate, interpolate  # noqa: E402
-from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
-from share.lab.evaluate.simulation import Simulation  # noqa: E402
-from share.lab.evaluate.virtual_time import track_session  # noqa: E402
 from share.mapping.map_changes import StoredMap, map_poses  # noqa: E402
 from share.protocol.agent_events import LocalisedPose  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.recordings.trajectory import read_tum  # noqa: E402
-from share.store.map_store import MapStore  # noqa: E402
 from share.types import F64  # noqa: E402
-from share.wire.messages import Hello  # noqa: E402
 
 WRONG_M, WRONG_RAD = 0.5, float(np.radians(10))
 SEEN_M, SEEN_RAD = 1.0, float(np.radians(30))
-_DRAIN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -70,29 +59,6 @@ class NextDay:
     saved_cm: float
     saved_keyframes: int
     saved_left: int
-
-
-def play(session: Session, store: MapStore, first_run: int) -> Simulation:
-    """Play a session to its end against an edge that continues the map. first_run: number of a run."""
-    settings = Config()
-    tracked = track_session(
-        session.folder.resolve(), settings.tracker, settings.inertial, settings.sequencer, ""
-    )
-    network = LinkAssignment.parse(None)
-    start_ns = min(frames[0].arrival_ns for _, frames in tracked.values())
-    end_ns = max(frames[-1].arrival_ns for _, frames in tracked.values())
-    members = [
-        (
-            Hello(name, agent.kind, first_run + number, tracked[name][0]),
-            (replace(frame, arrival_ns=frame.arrival_ns - start_ns) for frame in tracked[name][1]),
-            network.network_for(name),
-        )
-        for number, (name, agent) in enumerate(session.agents.items())
-    ]
-    world = Simulation(settings, members, ProcessingDelays(), 1, store=store)
-    world.run((end_ns - start_ns) * 1e-9 + _DRAIN_S)
-    store.write([world.mapper.current_poses()])
-    return world
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,15 +92,9 @@ def saved_maps(session: Session, kept: StoredMap) -> dict[str, SavedMap]:
 
 def measure(first: Path, second: Path) -> list[NextDay]:
     """Play both days and return a result for each agent of the second."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "room.sqlite"
-        with MapStore.open(path) as store:
-            play(read_session(first), store, 1)
-        with MapStore.open(path) as store:
-            kept = store.load()
-            maps = saved_maps(read_session(first), kept)
-            world = play(read_session(second), store, 101)
-            later = {k.keyframe_key for k in store.load().keyframes}
+    kept, on_second, world = play_days(read_session(first), read_session(second))
+    maps = saved_maps(read_session(first), kept)
+    later = {k.keyframe_key for k in on_second.keyframes}
     saved_cm = 100 * float(np.sqrt(np.mean(np.concatenate([one.errors_m for one in maps.values()]) ** 2)))
     left = sum(k.keyframe_key in later for k in kept.keyframes)
     common = len(maps), saved_cm, len(kept.keyframes), left
@@ -184,26 +144,5 @@ _TITLES = (
 )
 
 
-def _text(value: object) -> str:
-    return "-" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("sessions", nargs="+", type=Path, metavar="FIRST SECOND")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args()
-    if len(options.sessions) % 2:
-        raise UsageError("give pairs of sessions: FIRST SECOND")
-    print(line(_TITLES), line(["---"] * len(_TITLES)), sep="\n", flush=True)
-    results = []
-    for first, second in zip(options.sessions[::2], options.sessions[1::2], strict=True):
-        for one in measure(first, second):
-            results.append(one)
-            print(line(map(_text, asdict(one).values())), flush=True)
-    if options.json:
-        options.json.write_text(json.dumps([asdict(one) for one in results], indent=2))
-
-
 if __name__ == "__main__":
-    sys.exit(exit_code("measure_next_day", main))
+    sys.exit(exit_code("measure_next_day", lambda: run_pairs(__doc__ or "", _TITLES, measure)))

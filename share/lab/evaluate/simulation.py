@@ -32,6 +32,7 @@ from share.metrics.frame_log import RunLog
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.agent import Agent
+from share.protocol.common_events import EdgeMessageReceived, SendToEdge, Tick
 from share.protocol.edge import Edge
 from share.protocol.peer import restored_runs
 from share.store.keyframe_archive import KeyframeArchive
@@ -140,7 +141,7 @@ class Simulation:
     def _tick(self) -> None:
         for member in self._members.values():
             self._to_agent(member, ev.AgentTick())
-        self._to_edge(ed.EdgeTick())
+        self._to_edge(Tick())
         self._schedule(_TICK_MS * MS_NS, self._tick)
 
     # Agents.
@@ -192,7 +193,7 @@ class Simulation:
         for effect in member.machine.handle(event, self.now_ns):
             self._on_effect(member.name, effect)
             match effect:
-                case ev.SendToEdge():
+                case SendToEdge():
                     self._send_up(member, effect.frames)
                 case ev.LocalisedPose() if effect.T_map_odom is not None:
                     self.localised[member.name].append(effect)
@@ -248,7 +249,7 @@ class Simulation:
         def on_air_done() -> None:
             arrival_ns = member.down.arrival_ns(size, self.now_ns)
             self._schedule(
-                arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.EdgeMessageReceived(frames))
+                arrival_ns - self.now_ns, lambda: self._to_agent(member, EdgeMessageReceived(frames))
             )
 
         self._over_the_air(member, _ACCESS_POINT, size, on_air_done)

@@ -10,6 +10,7 @@ from share.lab.evaluate.emulated_network import NetworkModel
 from share.lab.evaluate.simulation import SimulatedRun, Simulation
 from share.protocol import agent_events as aev
 from share.protocol import edge_events as ed
+from share.protocol.common_events import Connected
 from share.timing import seconds_to_ns
 from share.wire.layouts import Bytes
 from share.wire.messages import Hello
@@ -37,7 +38,7 @@ class BreakableRoom(Simulation):
         self._is_edge_up = True
         self._start_edge(self._edge_life)
         for member in self._members.values():
-            self._schedule(_RECONNECT_NS, lambda member=member: self._to_agent(member, aev.Connected()))  # type: ignore[misc]
+            self._schedule(_RECONNECT_NS, lambda member=member: self._to_agent(member, Connected()))  # type: ignore[misc]
 
     def _to_edge(self, event: ed.EdgeEvent) -> None:
         if self._is_edge_up:
@@ -61,7 +62,7 @@ class BreakableRoom(Simulation):
     def start_agent(self, hello: Hello, network: NetworkModel, seed: int) -> None:
         """Start another run of an agent, whose frames are pushed."""
         self._add_member(hello, iter(()), network, np.random.default_rng((seed, hello.run_id)).spawn(2))
-        self._schedule(_RECONNECT_NS, lambda: self._to_agent(self.run_of(hello.name), aev.Connected()))
+        self._schedule(_RECONNECT_NS, lambda: self._to_agent(self.run_of(hello.name), Connected()))
 
     def run_of(self, name: str) -> SimulatedRun:
         """Return the newest run of an agent. Raises KeyError without one."""

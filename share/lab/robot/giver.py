@@ -31,7 +31,7 @@ class Pointing(Protocol):
 
 
 def points_in_room() -> tuple[PlanarPose, str | None]:
-    """The map is the room: for a robot that is told where it is."""
+    """The map is the room: for a robot that knows its true place."""
     return PlanarPose(0.0, 0.0, 0.0), None
 
 

@@ -23,6 +23,7 @@ from share.lab.robot.breakable import BreakableRoom
 from share.lab.robot.navigator import CONTROL_S, STOP, CmdVel, Navigator
 from share.lab.robot.planner import Costmap, RoomGrid
 from share.protocol import agent_events as aev
+from share.protocol.common_events import PrintLine, Tick
 from share.robot import robot_events as ev
 from share.robot.bridge import RobotBridge
 from share.robot.planar import PlanarPose, flattened
@@ -70,7 +71,7 @@ class RobotLoop(BreakableRoom):
     """The robot, its navigation, its bridge, and the room's agents and edge.
 
     agent: the robot's; None where `own_pose` says where it is instead, T_map_base at each of frame_times_ns.
-    on_report, on_trace: called with what a commander is told, and ten times a second.
+    on_report, on_trace: called with each report to a commander, and ten times a second.
     trace: time s, true place, place by the map or None, map. lines: time s, text. newest_poses: of each
     agent.
     """
@@ -219,7 +220,7 @@ class RobotLoop(BreakableRoom):
             case aev.StatusReport() if effect.is_stale and effect.stamp_ns is not None:
                 status = effect.status
                 self._send_message(self._messages.of_state(effect.stamp_ns, status.state, status.pose_age_ms))
-            case aev.PrintLine():
+            case PrintLine():
                 self.note(f"agent: {effect.text}")
 
     @property
@@ -247,7 +248,7 @@ class RobotLoop(BreakableRoom):
             self.on_report(ev.GoalReport(goal["commander"], "the bridge has ended", is_final=True))
 
     def _bridge_tick(self) -> None:
-        self.to_bridge(ev.BridgeTick())
+        self.to_bridge(Tick())
         self._schedule(_TICK_NS, self._bridge_tick)
 
     def to_bridge(self, event: ev.RobotEvent) -> None:
@@ -277,7 +278,7 @@ class RobotLoop(BreakableRoom):
                 if not effect.text.endswith("to go"):
                     self.note(f"{effect.commander}: {effect.text}")
                 self.on_report(effect)
-            case ev.BridgeLine():
+            case PrintLine():
                 self.note(effect.text)
 
     @property

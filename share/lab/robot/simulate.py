@@ -43,7 +43,7 @@ SHARE, TRUTH, WHEELS = "share", "truth", "wheels"
 LOCALISATIONS = (SHARE, TRUTH, WHEELS)
 LINK = "wifi5"
 _ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
-_FRAME_HZ = 15.0  # of a robot that is told where it is
+_FRAME_HZ = 15.0  # of a robot that knows its true place
 _STEP_S = 0.5
 _CAMERA_M = (0.09, 0.018, 0.21)
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from share.types import F32, F64, I64, U8
+from share.types import DESCRIPTOR_BYTES, F32, F64, I64, U8
 
 TABLES = 8  # hash functions
 HASH_BITS = 16  # descriptor bits that form a word in each table
@@ -50,7 +50,8 @@ class PlaceIndex:
 
     def __init__(self, seed: int = SEED, tables: int = TABLES, bits: int = HASH_BITS) -> None:
         rng = np.random.default_rng(seed)
-        self._sampled_bits = np.stack([rng.choice(256, bits, replace=False) for _ in range(tables)])
+        size = 8 * DESCRIPTOR_BYTES
+        self._sampled_bits = np.stack([rng.choice(size, bits, replace=False) for _ in range(tables)])
         self._word_counts = np.zeros(tables << bits, np.int32)
         self._pages: list[IndexPage] = []
         self._unpaged: dict[int, U32] = {}  # words of the newest keyframes

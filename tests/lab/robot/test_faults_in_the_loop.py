@@ -10,8 +10,8 @@ from helpers.robot_loop import Drive
 from share.lab.robot.faults import RIVAL, LoopFault, schedule_faults
 from share.lab.robot.goals import REACHED_M
 from share.lab.robot.simulate import usual_robot
-from share.robot.area import DrivingArea
 from share.robot.planar import PlanarPose
+from share.robot.settings import DrivingArea
 
 pytestmark = pytest.mark.long
 

@@ -16,7 +16,7 @@ class RenderError(ShareError):
 _VERSION = 430  # of OpenGL, for storage buffers
 _EGL, _GL = "libEGL.so.1", "libGL.so.1"  # by name: ctypes finds the unversioned ones by tools that may lack
 _ENVIRONMENT = {
-    # Mesa's software driver uses a thread per core unless told otherwise before the context is created. 0:
+    # Mesa's software driver uses a thread per core unless set otherwise before the context is created. 0:
     # everything runs in the calling thread; to use two cores, start two processes.
     "LP_NUM_THREADS": "0",
     # With 8-bit textures the software driver interpolates with 8 bits of fraction, four channels at a time;

@@ -169,7 +169,7 @@ def _furnish_passage(plan: LayoutBuilder, outer: Wall, core: Wall) -> None:
 
 
 def _add_differences(plan: LayoutBuilder, inner: Walls) -> None:
-    """One more small object on each side, so that the corridors can be told apart by details."""
+    """One more small object on each side, so that details distinguish the corridors."""
     for wall in (inner[0], inner[2]):
         fill.hang_on_wall(plan, wall, {"notice": (1, building.notice)}, 1, 1.7)
 

@@ -14,8 +14,8 @@ from share.mapping.loops import KeyframeKey
 from share.types import AgentKind
 from share.view import drawing as dr
 from share.view import events as ev
-from share.view import loop_pictures
-from share.view.loop_pictures import KeyframePictures, nearest_to_ray
+from share.view import loop_views
+from share.view.loop_views import KeyframePictures, nearest_to_ray
 from share.view.room import Room
 from share.view.viewer import Viewer
 
@@ -87,7 +87,7 @@ def test_a_picture_that_is_gone_is_said_to_be(room: Room) -> None:
 
 
 def test_pictures_are_bounded_and_damaged_ones_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop_pictures, "_KEPT", 3)
+    monkeypatch.setattr(loop_views, "_KEPT", 3)
     pictures = KeyframePictures()
     keys = [KeyframeKey("ann-1", k) for k in range(5)]
     for k, key in enumerate(keys):
@@ -112,7 +112,7 @@ class Page:
     def take_clicks(self) -> list[Any]:
         return [self._clicks.pop() for _ in range(len(self._clicks))]
 
-    def show_views(self, browser: int, views: loop_pictures.LoopViews) -> None:
+    def show_views(self, browser: int, views: loop_views.LoopViews) -> None:
         self.shown.append((browser, views.titles))
 
     def disconnect_on_failure(self, browser: int) -> Any:

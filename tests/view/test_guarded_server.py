@@ -8,7 +8,7 @@ import pytest
 
 msgspec = pytest.importorskip("msgspec", reason="viser is not installed")
 
-from share.view.browser_messages import is_taken  # noqa: E402
+from share.view.guarded_server import is_taken  # noqa: E402
 
 CAMERA: dict[str, Any] = {
     "type": "ViewerCameraMessage",
