@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from share.scheduling.qoe import QoeParameters
+from share.scheduling.rate_allocation import STEP_HZ
 from share.scheduling.room_budget import (
     FREE_WAIT_MS,
     SILENT_S,
-    STEP_HZ,
     AgentAir,
     RateGrant,
     RoomBudget,
@@ -127,8 +127,7 @@ class RoomController:
             self._grants = {n: RateGrant(agent.wanted_hz) for n, agent in self._budget.agents.items()}
             return
         before = self._grants
-        most = self._budget.allocate(before=before)
-        least = self._budget.allocate(plenty_ms, before)
+        least, most = self._budget.allocate((plenty_ms, FREE_WAIT_MS), before)
         self._grants = {
             name: replace(grant, hz=min(grant.hz, max(least[name].hz, before.get(name, grant).hz)))
             for name, grant in most.items()
