@@ -42,20 +42,24 @@ FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
 _MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
 _LEAST_AIR_S = 1e-3
-_LEAST_AIR_PART = 0.75  # of the usual T; no link is much faster than its room's
+_AT_ONCE_S = 4e-3  # of air that a transmission of Wi-Fi takes at most: what is in one arrives at once
+_MOST_OTHER_DELAY_MS = 200.0  # that others count for: what one claims beyond is its own
 Seconds = TypeVar("Seconds", float, F64)
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
 @dataclass(frozen=True)
 class AgentAir:
-    """What the room knows of one agent. wanted_hz: rate by its own QoE. keyframe_s: A. delay_ms, error_cm:
-    as in `qoe`. drift_cm: part of the error that grows between keyframes. hz: rate of its keyframes, poses
-    that it sends a second, both filtered. is_placed: it shares a map with somebody, or nobody is there."""
+    """What the room knows of one agent. wanted_hz: rate by its own QoE. keyframe_s: A, as it says.
+    arrival_s: from the message before a keyframe until that has arrived, as the edge sees it. delay_ms,
+    error_cm: as in `qoe`. drift_cm: part of the error that grows between keyframes. hz: rate of its
+    keyframes, pose_hz: of poses. Times and rates are filtered. is_placed: it shares a map with somebody, or
+    nobody is there."""
 
     terms: QoeParameters
     wanted_hz: float
     keyframe_s: float
+    arrival_s: float
     delay_ms: float
     error_cm: float | None
     drift_cm: float
@@ -65,9 +69,14 @@ class AgentAir:
     is_placed: bool = True
 
     @property
-    def other_delay_ms(self) -> float:
-        """Part of the delay that is not the air's, ms."""
-        return max(0.0, self.delay_ms - 1e3 * self.keyframe_s)
+    def seen_s(self) -> float:
+        """How long its keyframes take, as the edge sees it: what precedes one arrives with its beginning."""
+        return self.arrival_s + _AT_ONCE_S
+
+    @property
+    def claimed_part(self) -> float:
+        """A by what is seen: no keyframe is acknowledged before it has arrived."""
+        return max(self.keyframe_s, self.arrival_s) / self.seen_s
 
     @property
     def messages_hz(self) -> float:
@@ -95,21 +104,22 @@ class RoomBudget:
     agents: Mapping[str, AgentAir] = field(default_factory=dict)
 
     def with_report(self, name: str, reported: AgentAir, before: AgentAir | None = None) -> RoomBudget:
-        """Return the budget after an agent's report, whose keyframe_s, hz and pose_hz are filtered here.
-        Agents that are silent are dropped. before: what was known of this one before it fell silent."""
+        """Return the budget after an agent's report, whose times and rates are filtered here. Agents
+        that are silent are dropped. before: what was known of this one before it fell silent."""
         now_ns, before = reported.updated_ns, self.agents.get(name, before)
         if before is not None:
             elapsed_s = max(0.0, (now_ns - before.updated_ns) / 1e9)
             weight = -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
-            most_s = _MOST_RISE * max(before.keyframe_s, _LEAST_AIR_S)
-            reported = replace(reported, keyframe_s=min(reported.keyframe_s, most_s))
-            reported = replace(
-                reported,
-                **{
-                    key: getattr(before, key) + weight * (getattr(reported, key) - getattr(before, key))
-                    for key in ("keyframe_s", "hz", "pose_hz")
-                },
-            )
+            most = {
+                key: _MOST_RISE * max(getattr(before, key), _LEAST_AIR_S)
+                for key in ("keyframe_s", "arrival_s")
+            }
+            filtered = {
+                key: then + weight * (min(getattr(reported, key), most.get(key, math.inf)) - then)
+                for key in ("keyframe_s", "arrival_s", "hz", "pose_hz")
+                for then in [getattr(before, key)]
+            }
+            reported = replace(reported, **filtered)
         present = {n: a for n, a in self.agents.items() if now_ns - a.updated_ns < SILENT_S * 1e9}
         return RoomBudget({**present, name: reported})
 
@@ -118,12 +128,10 @@ class RoomBudget:
         return RoomBudget({n: a for n, a in self.agents.items() if n != name})
 
     def air_s(self, agent: AgentAir) -> float:
-        """Return T of an agent, s: at least a part of what is usual, since all share the air."""
-        return max(self._own_air_s(agent), _LEAST_AIR_PART * (self.usual_air_s or 0.0))
-
-    def _own_air_s(self, agent: AgentAir) -> float:
-        """Return T of an agent by its own report, s."""
-        return agent.keyframe_s * self._idle / (1 + agent.keyframe_s * self._keyframes_hz)
+        """Return T of an agent, s: what the edge sees of it, by as much longer as agents say that keyframes
+        take. So what one says of itself is no gain to it over others."""
+        taken_s = self._claimed_part * agent.seen_s
+        return taken_s * self._idle / (1 + taken_s * self._keyframes_hz)
 
     @property
     def load(self) -> float:
@@ -142,11 +150,29 @@ class RoomBudget:
         return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
     @cached_property
+    def _claimed_part(self) -> float:
+        """A by what is seen, as is usual in the room, of those whose keyframes do not arrive at once."""
+        agents = self.agents.values()
+        telling = [agent for agent in agents if agent.arrival_s >= _AT_ONCE_S] or agents
+        return _usual([agent.claimed_part for agent in telling]) or 0.0
+
+    @cached_property
     def usual_air_s(self) -> float | None:
-        """T in the median of all agents, s: that of one is noisy, or false; of two the lesser. None without
-        an agent."""
-        times = [self._own_air_s(agent) for agent in self.agents.values()]
-        return None if not times else median(times) if len(times) > 2 else min(times)
+        """T, s, as is usual in the room; None without an agent."""
+        return _usual([self.air_s(agent) for agent in self.agents.values()])
+
+    def other_delays_ms(self) -> F64:
+        """Return the part of each agent's delay (N,) that is not the air's, at least what is usual of its
+        form, of two the longer: nobody is served before others because it says that it is fast."""
+        agents = list(self.agents.values())
+        taken_ms = [1e3 * self._claimed_part * agent.seen_s for agent in agents]
+        other_ms = [max(0.0, agent.delay_ms - ms) for agent, ms in zip(agents, taken_ms, strict=True)]
+        usual_ms = dict[AgentKind, float]()
+        for form in {agent.terms.form for agent in agents}:
+            of_form = [ms for agent, ms in zip(agents, other_ms, strict=True) if agent.terms.form is form]
+            usual_ms[form] = median(of_form) if len(of_form) > 2 else max(of_form)
+        least_ms = [min(_MOST_OTHER_DELAY_MS, usual_ms[agent.terms.form]) for agent in agents]
+        return np.maximum(other_ms, least_ms)
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
         """Whether not everyone can send what it wants with a wait of less than `wait_ms` for others."""
@@ -184,11 +210,16 @@ class RoomBudget:
             least_hz=np.array([agent.least_hz for agent in agents]),
             wanted_hz=np.array([agent.wanted_hz for agent in agents]),
             held_hz=np.array([before[name].hz if name in before else 0.0 for name in self.agents]),
-            other_delay_ms=np.array([agent.other_delay_ms for agent in agents]),
+            other_delay_ms=self.other_delays_ms(),
             error_cm=error_cm,
             drift_cm=np.minimum([agent.drift_cm for agent in agents], error_cm),
             measured_hz=np.maximum([agent.hz for agent in agents], 1e-3),
         )
+
+
+def _usual(values: Sequence[float]) -> float | None:
+    """Return the median, which no single agent decides, of two the lesser; None of none."""
+    return None if not values else median(values) if len(values) > 2 else min(values)
 
 
 def message_s(keyframe_s: Seconds) -> Seconds:

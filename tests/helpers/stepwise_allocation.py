@@ -18,6 +18,8 @@ class StepwiseAllocation:
     def __init__(self, budget: RoomBudget, held_hz: dict[str, float]) -> None:
         self._budget, self._agents, self._held_hz = budget, budget.agents, held_hz
         self._air_s = {name: budget.air_s(one) for name, one in budget.agents.items()}
+        other_ms = budget.other_delays_ms().tolist()
+        self._other_delay_ms = dict(zip(budget.agents, other_ms, strict=True))
         forms = {one.terms.form for one in self._agents.values()}
         self._first_form = AgentKind.AR if AgentKind.AR in forms else AgentKind.ROBOT
 
@@ -62,7 +64,7 @@ class StepwiseAllocation:
     def _qoe(self, name: str, hz: float, load: float) -> float:
         """Return an agent's QoE, weighted, by its rate and the load of the air."""
         one = self._agents[name]
-        delay_ms = one.other_delay_ms + 1e3 * self._air_s[name] / (1 - load)
+        delay_ms = self._other_delay_ms[name] + 1e3 * self._air_s[name] / (1 - load)
         return WEIGHT[one.terms.form] * qoe(delay_ms, _error_cm(one, hz), one.terms)
 
 

@@ -31,6 +31,7 @@ def random_room(rng: np.random.Generator, count: int) -> RoomBudget:
             terms=replace(terms, signed=bool(rng.random() < 0.1)),
             wanted_hz=rng.uniform(0.1, 5.0),
             keyframe_s=own_ms / 1e3,
+            arrival_s=max(0.0, own_ms * rng.uniform(0.8, 1.2) - 4) / 1e3,
             delay_ms=rng.uniform(0, 100) + own_ms,
             error_cm=None if rng.random() < 0.1 else rng.uniform(0.4, 6.0),
             drift_cm=rng.uniform(0.05, 4.0),
@@ -76,7 +77,7 @@ def cpu_s(work: Callable[[], object]) -> float:
 
 def test_it_takes_a_tenth_of_the_time_of_the_plainest_way() -> None:
     """32 agents on air that is just short, where steps are most."""
-    one = AgentAir(TERMS[AR], 5.0, 0.005, 65.0, 1.5, 1.0, hz=1.0, pose_hz=5.0, updated_ns=0)
+    one = AgentAir(TERMS[AR], 5.0, 0.005, 0.001, 65.0, 1.5, 1.0, hz=1.0, pose_hz=5.0, updated_ns=0)
     room = RoomBudget({f"a{k}": replace(one, drift_cm=0.5 + k / 64) for k in range(32)})
     plainest = StepwiseAllocation(room, {})
     assert 1.0 < np.mean([grant.hz for grant in room.allocate()[0].values()]) < 5.0

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.modelled_air import Air
+from helpers.modelled_air import AT_ONCE_MS, Air
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ from share.scheduling.room_budget import (
     first_grant,
     message_s,
 )
-from share.scheduling.room_controller import RoomController
+from share.scheduling.room_controller import MeasuredAir, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -33,7 +33,8 @@ TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in (AR,
 def agent(kind: AgentKind = AR, keyframe_ms: float = 40.0, **given: float) -> AgentAir:
     fields = {"wanted_hz": 1.5, "delay_ms": 60 + keyframe_ms, "error_cm": 1.5, "drift_cm": 1.0} | given
     rates = {"hz": 1.0, "pose_hz": 30.0, "updated_ns": 0}
-    return AgentAir(terms=TERMS[kind], keyframe_s=keyframe_ms / 1e3, **(rates | fields))  # type: ignore[arg-type]
+    air = {"keyframe_s": keyframe_ms / 1e3, "arrival_s": max(0.0, keyframe_ms - AT_ONCE_MS) / 1e3}
+    return AgentAir(terms=TERMS[kind], **(rates | air | fields))  # type: ignore[arg-type]
 
 
 def room(*agents: AgentAir) -> RoomBudget:
@@ -42,7 +43,8 @@ def room(*agents: AgentAir) -> RoomBudget:
 
 def test_an_agent_whose_air_is_not_known_starts_slowly() -> None:
     told = Evaluation(0, 20.0, 1.0)
-    grants = [RoomController().grant("a0", TERMS[AR], 5.0, told, 0.0, (n, 0), S) for n in range(3)]
+    airs = [MeasuredAir(0.0, 0.0, n, 0) for n in range(3)]
+    grants = [RoomController().grant("a0", TERMS[AR], 5.0, told, air, S) for air in airs]
     assert grants == [first_grant(AR), first_grant(AR), RateGrant(5.0)]
 
 
@@ -115,12 +117,13 @@ def test_an_agent_that_claims_to_take_no_air_gains_little_and_delays_nobody(hone
     assert (1 - load(usual)) / (1 - load(granted)) < 1.25
 
 
-def test_an_agent_with_a_faster_link_counts_as_such_in_part() -> None:
-    budget = room(agent(), agent(), agent(), agent(keyframe_ms=36.0), agent(keyframe_ms=4.0))
-    usual = budget.usual_air_s
-    assert usual is not None and budget.air_s(budget.agents["a0"]) == usual
-    assert 0.75 * usual < budget.air_s(budget.agents["a3"]) < usual
-    assert budget.air_s(budget.agents["a4"]) == 0.75 * usual
+def test_an_agent_has_a_faster_link_if_the_edge_sees_it() -> None:
+    others = [agent()] * 3
+    fast, claims = agent(keyframe_ms=8.0), agent(keyframe_ms=0.0, arrival_s=0.036)
+    budget = room(*others, fast, claims)
+    own, claimed = (budget.air_s(budget.agents[name]) for name in ("a3", "a4"))
+    assert claimed == pytest.approx(budget.usual_air_s)
+    assert budget.usual_air_s is not None and 0.2 < own / budget.usual_air_s < 0.25
 
 
 def test_more_goes_to_whom_it_gains_more() -> None:
@@ -175,6 +178,7 @@ agents = st.builds(
     delay_ms=numbers,
     error_cm=st.none() | numbers,
     drift_cm=numbers,
+    arrival_s=st.floats(0, 1e4),
     hz=st.floats(0, 100),
     pose_hz=st.floats(0, 200),
 )
