@@ -172,9 +172,16 @@ class Edge:
 
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
-        arrived = peer.counts["keyframes"], peer.counts["poses"]
-        service = peer.computation.held_ms, self._registry.shares_map(peer), peer.arrival_ms
-        report = AgentReport(peer.hello.kind, evaluation, self._out.now_ns, *arrived, *service)
+        report = AgentReport(
+            kind=peer.hello.kind,
+            evaluation=evaluation,
+            now_ns=self._out.now_ns,
+            keyframes=peer.counts["keyframes"],
+            poses=peer.counts["poses"],
+            held_ms=peer.computation.held_ms,
+            is_placed=self._registry.shares_map(peer),
+            arrival_ms=peer.arrival_ms,
+        )
         computation_ms, t_s = peer.computation.ms, self._out.elapsed_s
         grant = self._rate_scheduler.evaluate(peer.name, report, computation_ms, t_s)
         self._membership.send_grant(peer, grant)
