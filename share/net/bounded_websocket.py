@@ -2,7 +2,8 @@
 
 A connection counts from its TCP handshake on, not from its first message. What waits too long, or sends more
 than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets that of one
-that has long had it: who reads for ever cannot be distinguished from who only holds a place.
+that has long had it: who reads for ever cannot be distinguished from who only holds a place. Some places may
+be kept for programs of the server's own machine.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _MAX_SLEEP_S = 0.1
 class PeerLimits:
     """max_open: connections served at once (`place_to_free`). max_waiting: before they are let in, or on
     their way out; one more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and
-    more by and by (per s)."""
+    more by and by (per s). kept_open: of max_open, for peers of the server's own machine."""
 
     max_open: int
     max_waiting: int
@@ -38,6 +39,7 @@ class PeerLimits:
     frames_per_s: float
     burst_bytes: float
     bytes_per_s: float
+    kept_open: int = 0
 
 
 def place_to_free(places: Sequence[tuple[str, float]], address: str, now_s: float) -> int | None:
@@ -82,14 +84,24 @@ class PeerConnections:
     def admit(self, connection: Any) -> bool:
         """Let a connection in, at the cost of another if need be. Return whether there is room."""
         if connection not in self._open:
-            if len(self._open) >= self.limits.max_open and not self._free_place(connection):
+            if not self._has_room(connection) and not self._free_place(connection):
                 return False
             self._waiting.pop(connection, None)
             self._open[connection] = time.monotonic()
         return True
 
+    def _has_room(self, newcomer: BoundedConnection) -> bool:
+        """Return whether a place is free that the newcomer may take."""
+        kept = 0 if newcomer.is_local else max(0, self.limits.kept_open - self._local_count)
+        return len(self._open) + kept < self.limits.max_open
+
+    @property
+    def _local_count(self) -> int:
+        return sum(holder.is_local for holder in self._open)
+
     def _free_place(self, newcomer: BoundedConnection) -> bool:
-        holders = list(self._open.items())
+        are_kept = not newcomer.is_local and self._local_count <= self.limits.kept_open
+        holders = [(one, since_s) for one, since_s in self._open.items() if not (are_kept and one.is_local)]
         places = [(holder.address, since_s) for holder, since_s in holders]
         chosen = place_to_free(places, newcomer.address, time.monotonic())
         if chosen is None:
@@ -117,14 +129,15 @@ class BoundedConnection(ServerConnection):  # type: ignore[misc]
 
     def __init__(self, *args: Any, connections: PeerConnections, **options: Any) -> None:
         super().__init__(*args, **options)
-        limits, self.address = connections.limits, ""
+        limits, self.address, self.is_local = connections.limits, "", False
         self._peer_connections = connections
         self._frames = TokenBucket(limits.burst, limits.frames_per_s)
         self._bytes = TokenBucket(limits.burst_bytes, limits.bytes_per_s)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self.address = _holder_of(transport.get_extra_info("peername"))
+        peer, own = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
+        self.address, self.is_local = _holder_of(peer), _is_own_machine(peer, own)
         self._peer_connections.arrive(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -148,6 +161,12 @@ def _holder_of(peer: Any) -> str:
     """Return whose address it is: of IPv6 the first 64 bits, of which one peer has all the others."""
     text = str(peer[0]).partition("%")[0] if peer else ""
     return ":".join(ip_address(text).exploded.split(":")[:4]) if ":" in text else text
+
+
+def _is_own_machine(peer: Any, own: Any) -> bool:
+    """Return whether a connection is of the machine that it goes to, by loopback or by an address of its
+    own."""
+    return bool(peer and own) and (peer[0] == own[0] or ip_address(peer[0].partition("%")[0]).is_loopback)
 
 
 class ModestSelector(selectors.DefaultSelector):

@@ -173,9 +173,16 @@ class Edge:
 
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
-        arrived = peer.counts["keyframes"], peer.counts["poses"]
-        service = peer.computation.held_ms, self._registry.shares_map(peer)
-        report = AgentReport(peer.hello.kind, evaluation, self._out.now_ns, *arrived, *service)
+        report = AgentReport(
+            kind=peer.hello.kind,
+            evaluation=evaluation,
+            now_ns=self._out.now_ns,
+            keyframes=peer.counts["keyframes"],
+            poses=peer.counts["poses"],
+            held_ms=peer.computation.held_ms,
+            is_placed=self._registry.shares_map(peer),
+            arrival_ms=peer.arrival_ms,
+        )
         computation_ms, t_s = peer.computation.ms, self._out.elapsed_s
         grant = self._rate_scheduler.evaluate(peer.name, report, computation_ms, t_s)
         self._membership.send_grant(peer, grant)
@@ -191,6 +198,8 @@ class Edge:
     # ------------------------------------------------------------------ keyframes and the map
 
     def _on_keyframe(self, peer: Peer, keyframe: Keyframe) -> None:
+        if peer.reorder_buffer.is_new(keyframe.id):
+            peer.arrival_ms = peer.since_last_ns / 1e6
         applicable = self._reorder(peer, keyframe)
         for ready in applicable:
             peer.counts["keyframes"] += 1

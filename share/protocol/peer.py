@@ -151,6 +151,10 @@ class Peer(Sender):
     grant: RateGrant | None = None  # the last that was sent
     computation: ComputationDelay = field(default_factory=ComputationDelay)
     credential: str | None = ""
+    since_last_ns: int = 0  # from the message before the newest until that; 0: there was none
+    arrival_ms: float = (
+        0.0  # the same of the newest keyframe that is new: how long it took to arrive, at most
+    )
 
     @property
     def map_id(self) -> str | None:
@@ -175,6 +179,7 @@ class Peer(Sender):
 
     def mark_received(self, now_ns: int) -> None:
         """Record that it has sent a message."""
+        self.since_last_ns = now_ns - self.last_received_ns if self.has_sent else 0
         self.last_received_ns, self.has_sent = now_ns, True
         if self.joined_ns is None:
             self.joined_ns = now_ns

@@ -176,6 +176,7 @@ def _rounded(vector: F64 | None) -> list[float] | None:
 
 
 MAX_READERS = 16  # at once; for one more see `share.net.bounded_websocket`
+OWN_READERS = 4  # of these, places that only programs of this machine get: engines run beside the agent
 _MAX_RECEIVED_BYTES = 1024  # of a message from a reader, which none needs to send
 _MAX_WAITING = 32  # connections that are not served yet
 _BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
@@ -227,7 +228,8 @@ class PoseWebSocket:
             raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
         self.host = HostPort(host.name, int(self._listener.getsockname()[1]))
         # a page's request has some kB; a reader then sends an answer to a ping now and then
-        self.peer_connections = PeerConnections(PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10))
+        limits = PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10, OWN_READERS)
+        self.peer_connections = PeerConnections(limits)
         self._loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
         self._loop.set_exception_handler(self._take_loop_error)
         self._new_message = asyncio.Event()  # replaced at each message

@@ -23,7 +23,7 @@ from share.config import BASE_POLICY, ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
 from share.scheduling.room_budget import RateGrant
-from share.scheduling.room_controller import RoomController
+from share.scheduling.room_controller import MeasuredAir, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -71,7 +71,8 @@ _FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 class AgentReport:
     """An evaluation as it arrives at the edge. now_ns: by the edge's clock. keyframes, poses: of this agent,
     that have arrived so far. held_ms: how long the edge holds acknowledgements, for its disk. is_placed: see
-    `share.scheduling.room_budget.AgentAir`."""
+    `share.scheduling.room_budget.AgentAir`. arrival_ms: from the message before its newest keyframe until
+    that had arrived, by the edge's clock."""
 
     kind: AgentKind
     evaluation: Evaluation
@@ -80,6 +81,7 @@ class AgentReport:
     poses: int = 0
     held_ms: float = 0.0
     is_placed: bool = True
+    arrival_ms: float = 0.0
 
 
 class Policy:
@@ -217,8 +219,8 @@ class SharePolicy(Policy):
         trip = self._base_trips.get(agent, BaseDelay()).with_delay(evaluation.rtt_ms, report.now_ns)
         self._base_trips[agent] = trip
         air_ms = max(0.0, evaluation.ack_ms - trip.ms - report.held_ms)
-        counts = report.keyframes, report.poses
-        return self._room.grant(agent, terms, hz, evaluation, air_ms, counts, report.now_ns, report.is_placed)
+        air = MeasuredAir(air_ms, report.arrival_ms, report.keyframes, report.poses)
+        return self._room.grant(agent, terms, hz, evaluation, air, report.now_ns, report.is_placed)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -115,10 +116,42 @@ class QoeTable:
 
     def qoe(self, delay_ms: F64, error_cm: F64) -> F64:
         """Return `qoe` of each agent (N,). error_cm NaN: unknown."""
+        return self.delay_factor(delay_ms) * self.error_factor(error_cm)
+
+    def take(self, members: NDArray[np.intp]) -> QoeTable:
+        """Return the parameters of some agents, by index."""
+        beta, gamma, theta_ms = self.beta[members], self.gamma[members], self.theta_ms[members]
+        return QoeTable(self.is_ar[members], beta, gamma, theta_ms, self.lowest_penalty[members])
+
+    def delay_factor(self, delay_ms: F64) -> F64:
+        """Return the factor of the QoE due to delay of each agent (..., N)."""
+        if self._are_all_ar:
+            return self._penalty_factor(delay_ms - ACCEPTED_DELAY_MS)
+        quality = self._quality_factor(1.0 / (delay_ms + self.theta_ms))
+        if self._are_all_robots:
+            return quality
+        return np.where(self.is_ar, self._penalty_factor(delay_ms - ACCEPTED_DELAY_MS), quality)
+
+    def error_factor(self, error_cm: F64) -> F64:
+        """Return the factor of the QoE due to error of each agent (..., N). error_cm NaN: unknown."""
         accuracy = 1.0 / np.maximum(error_cm, MIN_ERROR_CM)
         accuracy = np.where(np.isnan(accuracy), REFERENCE_ACCURACY, accuracy)
-        penalty = np.where(self.is_ar, delay_ms - ACCEPTED_DELAY_MS, REFERENCE_ACCURACY - accuracy)
-        quality = np.where(self.is_ar, accuracy, 1.0 / (delay_ms + self.theta_ms))
+        penalty = self._penalty_factor(REFERENCE_ACCURACY - accuracy)
+        return np.where(self.is_ar, self._quality_factor(accuracy), penalty)
+
+    @cached_property
+    def _are_all_ar(self) -> bool:
+        return bool(self.is_ar.all())
+
+    @cached_property
+    def _are_all_robots(self) -> bool:
+        return not self.is_ar.any()
+
+    def _penalty_factor(self, penalty: F64) -> F64:
         exponent = -self.beta * np.maximum(penalty, self.lowest_penalty)
-        out: F64 = np.exp(np.minimum(exponent, _MAX_EXPONENT)) * -np.expm1(-self.gamma * quality)
+        out: F64 = np.exp(np.minimum(exponent, _MAX_EXPONENT))
+        return out
+
+    def _quality_factor(self, quality: F64) -> F64:
+        out: F64 = -np.expm1(-self.gamma * quality)
         return out

@@ -11,7 +11,8 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from share.scheduling.room_budget import MAX_LOAD, RoomBudget, least_load
+from share.scheduling.rate_allocation import MAX_LOAD
+from share.scheduling.room_budget import RoomBudget, least_load
 from share.timing import seconds_to_ns
 from share.types import AgentKind
 

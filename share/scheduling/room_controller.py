@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from share.scheduling.qoe import QoeParameters
+from share.scheduling.rate_allocation import STEP_HZ
 from share.scheduling.room_budget import (
     FREE_WAIT_MS,
     SILENT_S,
-    STEP_HZ,
     AgentAir,
     RateGrant,
     RoomBudget,
@@ -50,8 +50,20 @@ _STARTING_LOAD = 0.5  # of the air that is free, for all that begin
 _PLENTY = 0.75  # of the free wait: less, and the air is no longer short
 
 
+@dataclass(frozen=True)
+class MeasuredAir:
+    """What is measured of an agent's air. keyframe_ms: A, as it reports. arrival_ms: from the message before
+    its newest keyframe until that had arrived, by the edge's clock. keyframes, poses: that have arrived so
+    far."""
+
+    keyframe_ms: float
+    arrival_ms: float
+    keyframes: int
+    poses: int
+
+
 class RoomController:
-    """The budget of one edge over time. Counts are of messages that have arrived so far."""
+    """The budget of one edge over time."""
 
     def __init__(self) -> None:
         self._budget = RoomBudget()
@@ -85,18 +97,17 @@ class RoomController:
         terms: QoeParameters,
         wanted_hz: float,
         evaluation: Evaluation,
-        air_ms: float,
-        counts: tuple[int, int],
+        air: MeasuredAir,
         now_ns: int,
         is_placed: bool = True,
     ) -> RateGrant:
-        """Return what an agent may send, by its evaluation. air_ms: A. counts: its keyframes and poses so
-        far. is_placed: see `AgentAir`."""
-        hz, pose_hz = self._rates(name, counts, now_ns)
+        """Return what an agent may send, by its evaluation. is_placed: see `AgentAir`."""
+        hz, pose_hz = self._rates(name, (air.keyframes, air.poses), now_ns)
         reported = AgentAir(
             terms=terms,
             wanted_hz=wanted_hz,
-            keyframe_s=air_ms / 1e3,
+            keyframe_s=air.keyframe_ms / 1e3,
+            arrival_s=air.arrival_ms / 1e3,
             delay_ms=evaluation.delay_ms,
             error_cm=evaluation.error_cm,
             drift_cm=evaluation.drift_cm,
@@ -105,12 +116,12 @@ class RoomController:
             updated_ns=now_ns,
             is_placed=is_placed,
         )
-        if not counts[0]:  # no keyframe has arrived that would confirm its report
+        if not air.keyframes:  # no keyframe has arrived that would confirm its report
             return self.first_grant(terms.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]
         self._reassess_capacity(now_ns)
-        if counts[0] < _SLOW_START_KEYFRAMES:
+        if air.keyframes < _SLOW_START_KEYFRAMES:
             return self.first_grant(terms.form, now_ns)
         self._starting.pop(name, None)
         if not self._is_short or name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
@@ -127,8 +138,7 @@ class RoomController:
             self._grants = {n: RateGrant(agent.wanted_hz) for n, agent in self._budget.agents.items()}
             return
         before = self._grants
-        most = self._budget.allocate(before=before)
-        least = self._budget.allocate(plenty_ms, before)
+        least, most = self._budget.allocate((plenty_ms, FREE_WAIT_MS), before)
         self._grants = {
             name: replace(grant, hz=min(grant.hz, max(least[name].hz, before.get(name, grant).hz)))
             for name, grant in most.items()

@@ -7,12 +7,13 @@ import numpy as np
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
 from share.scheduling.room_budget import OTHER_HZ, first_grant, message_s
-from share.scheduling.room_controller import RoomController
+from share.scheduling.room_controller import MeasuredAir, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 S = 1_000_000_000
 STEP_S = 0.5
+AT_ONCE_MS = 4.0  # of air that one transmission takes: what precedes a keyframe arrives with its beginning
 TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in AgentKind}
 
 
@@ -68,8 +69,12 @@ class Air:
             if sent_s is None:  # during a pause nothing arrives
                 self.counts[k][0] += STEP_S * sent
                 self.counts[k][1] += STEP_S * (30.0 if pose_hz is None else pose_hz)
-            air_ms = keyframe_ms * float(np.exp(self._noise * self._rng.standard_normal()))
+            air_ms = keyframe_ms * self._noisy()
             told = Evaluation(0, 60 + air_ms, 1.2, 10.0, 5.0, 5 + air_ms, 0.5)
             counts = round(self.counts[k][0]), round(self.counts[k][1])
-            at = f"a{k}", TERMS[kind], self.wanted_hz[kind], told, air_ms, counts, round(self.now_s * S)
-            self.grants[k] = self.room.grant(*at)
+            seen_ms = max(0.0, keyframe_ms * self._noisy() - AT_ONCE_MS)
+            at = f"a{k}", TERMS[kind], self.wanted_hz[kind], told, MeasuredAir(air_ms, seen_ms, *counts)
+            self.grants[k] = self.room.grant(*at, round(self.now_s * S))
+
+    def _noisy(self) -> float:
+        return float(np.exp(self._noise * self._rng.standard_normal()))

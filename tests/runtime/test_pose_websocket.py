@@ -17,7 +17,7 @@ import pytest
 
 from share.errors import ShareError
 from share.runtime.pose import Pose
-from share.runtime.pose_feed import MAX_READERS, PoseWebSocket, open_pose_sinks
+from share.runtime.pose_feed import MAX_READERS, OWN_READERS, PoseWebSocket, open_pose_sinks
 from share.types import TrackState
 
 client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
@@ -179,6 +179,33 @@ def test_a_reader_that_has_long_read_gives_its_place_to_a_newcomer(served, monke
             assert is_disconnected(first)
             assert gets_poses(served, newcomer) and gets_poses(served, second)
             assert served.peer_connections.open_count == MAX_READERS
+
+
+def test_readers_of_other_machines_leave_places_to_programs_of_this_one(served, monkeypatch):
+    """Sixteen addresses with correct connections keep no engine beside the agent out, not for a moment."""
+    monkeypatch.setattr(bounded_websocket, "_is_own_machine", lambda peer, own: peer[0] == "127.0.0.1")
+    places = MAX_READERS - OWN_READERS
+    with contextlib.ExitStack() as stack:
+        for k in range(places):
+            other = from_address(served, f"127.0.1.{k + 1}")
+            stack.enter_context(client.connect(f"ws://{served.host}", sock=other))
+        with pytest.raises(exceptions.InvalidStatus, match="503"):
+            client.connect(f"ws://{served.host}", sock=from_address(served, "127.0.1.99"))
+        own = [stack.enter_context(connected(served)) for _ in range(OWN_READERS)]
+        assert served.peer_connections.open_count == MAX_READERS
+        monkeypatch.setattr(bounded_websocket, "SURE_S", 0.0)
+        with client.connect(f"ws://{served.host}", sock=from_address(served, "127.0.1.99")):
+            assert served.peer_connections.open_count == MAX_READERS
+            assert all(gets_poses(served, reader) for reader in own)
+
+
+def test_a_program_of_this_machine_is_known_by_its_address():
+    is_own = bounded_websocket._is_own_machine
+    assert is_own(("127.0.0.2", 1), ("127.0.0.1", 2)) and is_own(("10.0.0.7", 1), ("10.0.0.7", 2))
+    assert is_own(("::1", 1, 0, 0), ("::1", 2, 0, 0)) and is_own(
+        ("fe80::1%a", 1, 0, 2), ("fe80::1%a", 2, 0, 2)
+    )
+    assert not is_own(("10.0.0.8", 1), ("10.0.0.7", 2)) and not is_own(None, None)
 
 
 def test_a_reader_that_answers_no_ping_is_disconnected(monkeypatch):

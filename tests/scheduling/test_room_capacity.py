@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+from helpers.modelled_air import AT_ONCE_MS
 
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
 from share.scheduling.room_budget import AgentAir, RoomBudget
 from share.scheduling.room_capacity import TOLERATED_AIR_MS, RoomCapacity, crowded_air_ms
-from share.scheduling.room_controller import RoomController
+from share.scheduling.room_controller import MeasuredAir, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -20,7 +23,8 @@ KEYFRAME_MS = 54.0  # at 5 Mbit/s
 
 def room(headsets: int, robots: int, keyframe_ms: float = KEYFRAME_MS, other_ms: float = 60.0) -> RoomBudget:
     def agent(kind: AgentKind) -> AgentAir:
-        times = {"keyframe_s": keyframe_ms / 1e3, "delay_ms": other_ms + keyframe_ms}
+        times = {"keyframe_s": keyframe_ms / 1e3, "arrival_s": (keyframe_ms - AT_ONCE_MS) / 1e3}
+        times["delay_ms"] = other_ms + keyframe_ms
         return AgentAir(
             TERMS[kind], wanted_hz=1.5, error_cm=1.0, drift_cm=0.5, hz=0.0, pose_hz=0.0, updated_ns=0, **times
         )
@@ -62,7 +66,7 @@ def test_a_room_full_of_headsets_says_so() -> None:
 
 @pytest.mark.parametrize("honest", [1, 2, 6])
 def test_an_agent_that_reports_bad_air_shuts_nobody_out(honest: int) -> None:
-    liar = room(1, 0, keyframe_ms=9000.0).agents["ar0"]
+    liar = replace(room(1, 0).agents["ar0"], keyframe_s=9.0)
     budget = RoomBudget({**room(honest, 1).agents, "liar": liar})
     capacity = settled(budget)
     assert [capacity.objection(kind, 10 * S) for kind in AgentKind] == [None, None]
@@ -86,8 +90,8 @@ def test_robots_alone_refuse_no_robot() -> None:
 def test_a_room_that_all_have_left_is_not_full(gone_s: float) -> None:
     controller, told = RoomController(), Evaluation(0, 1050.0, 1.0, 10.0, 5.0, 800.0, 0.5)
     for k in range(400):
-        counts = 9 + k // 40, k
-        controller.grant(f"a{k % 20}", TERMS[AR], 1.5, told, 800.0, counts, k * S // 20)
+        air = MeasuredAir(800.0, 796.0, 9 + k // 40, k)
+        controller.grant(f"a{k % 20}", TERMS[AR], 1.5, told, air, k * S // 20)
     assert controller.objection(AR, 20 * S) is not None
     if gone_s < 3:
         assert controller.objection(AR, round((20 + gone_s) * S)) is not None

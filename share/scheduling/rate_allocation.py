@@ -1,0 +1,202 @@
+"""Shares out short air among agents: rates in small steps, each to whom it gains most QoE for its air.
+
+A QoE is a factor of the delay, the same for all rates of an agent, times one of the error, which falls with
+its own rate only (`share.scheduling.qoe`). So what a step gains is looked up in a table made once, times the
+factor of the delay at the present load, and one table serves several waits: what is given out while all are
+free to take a step is the same for each longer wait.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.scheduling.qoe import QoeTable
+from share.types import F64
+
+STEP_HZ = 0.25  # in which rates are allocated, and rise again
+MAX_LOAD = 0.95  # beyond, the formula has no meaning
+_HELD = 1.5  # how much more a step must gain another agent than one that has it already
+_LOAD_STEP = 0.01
+_LEAST_AIR_S = 1e-6
+_GIVEN = -1.0  # gain of an agent that has all it wants: less than any
+
+
+@dataclass(frozen=True, eq=False)
+class AirDemand:
+    """What N agents want of the air that they share, arrays (N,). air_s: T, of a keyframe alone; usual_air_s:
+    for the room as a whole. message_load: of all small messages. weight: of an agent's QoE. other_delay_ms:
+    the part of its delay that is not the air's. error_cm: NaN if unknown; drift_cm: the part of it that
+    grows between keyframes, at measured_hz. held_hz: what it has."""
+
+    terms: QoeTable
+    air_s: F64
+    usual_air_s: float
+    message_load: float
+    weight: F64
+    least_hz: F64
+    wanted_hz: F64
+    held_hz: F64
+    other_delay_ms: F64
+    error_cm: F64
+    drift_cm: F64
+    measured_hz: F64
+
+    def load(self, hz: F64) -> float:
+        """Return the load at these rates, at most MAX_LOAD."""
+        return min(MAX_LOAD, self.message_load + float(hz @ self.air_s))
+
+
+def most_load(usual_air_s: float, wait_ms: float) -> float:
+    """Return the load at which a keyframe waits `wait_ms` for others, T / (1 - load) - T; inf where it never
+    waits so long."""
+    load = wait_ms / (1e3 * usual_air_s + wait_ms)
+    return load if load < MAX_LOAD else math.inf
+
+
+def allocate_rates(demand: AirDemand, waits_ms: Sequence[float]) -> list[F64]:
+    """Return the rates (N,), Hz, for each of `waits_ms`, which rise: the least rates, then a step at a time
+    to the agent that gains most by it. While keyframes wait for others for less, agents of the AR form come
+    before others; beyond, a step must gain more than the delay that it causes costs all, and only they get
+    one, unless there is none of them."""
+    if not len(demand.wanted_hz):
+        return [np.zeros(0) for _ in waits_ms]
+    table = _GainTable(demand)
+    shared, allocated = _Allocation.least(table), list[F64]()
+    for wait_ms in waits_ms:
+        limit = most_load(demand.usual_air_s, wait_ms)
+        for group in table.groups:
+            if not shared.fill(group, limit, only_while_all_fit=True):
+                break
+        own = shared.copy()
+        for group in table.groups:
+            own.fill(group, limit)
+        own.fill_while_worth_it(table.groups[0])
+        allocated.append(own.hz)
+    return allocated
+
+
+class _GainTable:
+    """QoE of N agents by number of steps above the least rate, without its factor of the delay.
+
+    rates_hz (N, K): rates. worth (N, K): what one more step gains for its load, `_GIVEN` where it is not
+    wanted. error_factor (N, K): weighted. groups: agents of one form each, in the order in which they are
+    served."""
+
+    def __init__(self, demand: AirDemand) -> None:
+        self.demand, self.step_load = demand, STEP_HZ * demand.air_s
+        self.rates_hz = _rates_above(demand.least_hz, demand.wanted_hz)
+        growth = demand.measured_hz[:, None] / np.maximum(self.rates_hz, 1e-3) - 1  # a random walk
+        error_cm = np.sqrt(demand.error_cm[:, None] ** 2 + demand.drift_cm[:, None] ** 2 * growth)
+        self.error_factor = demand.weight[:, None] * demand.terms.error_factor(error_cm.T).T
+        steps_hz = self.rates_hz[:, 1:]
+        self.worth = np.full(self.rates_hz.shape, _GIVEN)
+        self.worth[:, :-1] = np.where(
+            steps_hz <= demand.wanted_hz[:, None],
+            np.diff(self.error_factor)
+            / np.maximum(demand.air_s, _LEAST_AIR_S)[:, None]
+            * np.where(steps_hz <= demand.held_hz[:, None], _HELD, 1.0),
+            _GIVEN,
+        )
+        is_ar = demand.terms.is_ar
+        self.groups = [_Group(self, of_form) for of_form in (is_ar, ~is_ar) if of_form.any()]
+
+
+def _rates_above(least_hz: F64, wanted_hz: F64) -> F64:
+    """Return the rates (N, K) by number of steps, up to the highest wanted one and one beyond. Steps are
+    added one by one, so that a rate compares equal to the one that was granted."""
+    count = 1 + max(0, math.floor(float((wanted_hz - least_hz).max()) / STEP_HZ))
+    steps = np.full((len(least_hz), count + 1), STEP_HZ)
+    steps[:, 0] = least_hz
+    return np.cumsum(steps, axis=1)
+
+
+class _Group:
+    """Agents of one form. members: their indices."""
+
+    def __init__(self, table: _GainTable, of_form: NDArray[np.bool_]) -> None:
+        demand = table.demand
+        self.members = np.flatnonzero(of_form)
+        self.step_load = table.step_load[of_form]
+        self.largest_step = float(self.step_load.max())
+        self._terms = demand.terms.take(self.members)
+        self._other_delay_ms, self._air_ms = demand.other_delay_ms[of_form], 1e3 * demand.air_s[of_form]
+
+    def delay_factor(self, load: float) -> F64:
+        """Return the factor of the QoE due to delay of each member, at a load of the air."""
+        return self._terms.delay_factor(self._other_delay_ms + self._air_ms / (1 - load))
+
+
+class _Allocation:
+    """Rates while they are allocated: how many steps each agent has, and the load by them."""
+
+    def __init__(self, table: _GainTable, steps: NDArray[np.intp], load: float) -> None:
+        self._table, self._steps, self._load = table, steps, load
+
+    @classmethod
+    def least(cls, table: _GainTable) -> _Allocation:
+        demand = table.demand
+        return cls(table, np.zeros(len(demand.least_hz), np.intp), demand.load(demand.least_hz))
+
+    def copy(self) -> _Allocation:
+        return _Allocation(self._table, self._steps.copy(), self._load)
+
+    @property
+    def hz(self) -> F64:
+        return _at(self._table.rates_hz, self._steps)
+
+    def fill(self, group: _Group, limit: float, only_while_all_fit: bool = False) -> bool:
+        """Give out steps to a group up to a load. Return whether all members have what they want."""
+        worth = _at(self._table.worth, self._steps)[group.members]
+        while self._load < MAX_LOAD:
+            fits = self._load + group.largest_step <= limit
+            if not fits and only_while_all_fit:
+                return False
+            gains = group.delay_factor(self._load) * worth
+            best = int(gains.argmax())
+            if not fits or gains[best] <= 0:
+                is_open = worth != _GIVEN
+                if not is_open.any():
+                    return True
+                is_free = is_open & (self._load + group.step_load <= limit)
+                if not is_free.any():
+                    return False
+                best = int(np.where(is_free, gains, -np.inf).argmax())
+            self._give(group, best, worth)
+        return False
+
+    def fill_while_worth_it(self, group: _Group) -> None:
+        """Give out steps that gain more than the delay that they cause costs all agents."""
+        worth = _at(self._table.worth, self._steps)[group.members]
+        while self._load < MAX_LOAD:
+            gains = group.delay_factor(self._load) * worth
+            best = int(gains.argmax())
+            if gains[best] <= STEP_HZ * self._cost():
+                return
+            self._give(group, best, worth)
+
+    def _give(self, group: _Group, best: int, worth: F64) -> None:
+        """Give a step to a member; `worth` is kept current."""
+        member = group.members[best]
+        self._steps[member] += 1
+        self._load = min(MAX_LOAD, self._load + float(group.step_load[best]))
+        worth[best] = self._table.worth[member, self._steps[member]]
+
+    def _cost(self) -> float:
+        """Return the QoE, weighted, that all agents together lose by a load of one more."""
+        error_factor = _at(self._table.error_factor, self._steps)
+        lost = (
+            error_factor[group.members]
+            @ (group.delay_factor(self._load) - group.delay_factor(self._load + _LOAD_STEP))
+            for group in self._table.groups
+        )
+        return float(sum(lost)) / _LOAD_STEP
+
+
+def _at(table: F64, steps: NDArray[np.intp]) -> F64:
+    """Return of each row (N, K) the entry of its agent's steps (N,)."""
+    return table[np.arange(len(steps)), steps]
