@@ -6,6 +6,11 @@ measured, A, the time that keyframes take, and what arrives a second: L keyframe
 c + k T each. The load is L T + M (c + k T), so T = A (1 - M c) / (1 + A (L + k M)). It does not depend on the
 load, so rates that follow from it do not swing.
 
+A is an agent's own word. How agents compare is what the edge sees, D, the time from the message before a
+keyframe until that has arrived: D + 4 ms, since one transmission arrives at once. By how much A is longer
+than that is one figure for the room, and of an agent's other delay at least what is usual counts. So nobody
+gains over others by what it says of its air or speed (docs/understand/scheduling.md).
+
 Where keyframes at the rates that all want would wait for each other for more than `FREE_WAIT_MS`, every agent
 begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as long
 as they wait for less; then only where a step gains a headset more QoE than the delay that it causes costs
@@ -130,7 +135,7 @@ class RoomBudget:
     def air_s(self, agent: AgentAir) -> float:
         """Return T of an agent, s: what the edge sees of it, by as much longer as agents say that keyframes
         take. So what one says of itself is no gain to it over others."""
-        taken_s = self._claimed_part * agent.seen_s
+        taken_s = self._usual_part * agent.seen_s
         return taken_s * self._idle / (1 + taken_s * self._keyframes_hz)
 
     @property
@@ -150,7 +155,7 @@ class RoomBudget:
         return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
     @cached_property
-    def _claimed_part(self) -> float:
+    def _usual_part(self) -> float:
         """A by what is seen, as is usual in the room, of those whose keyframes do not arrive at once."""
         agents = self.agents.values()
         telling = [agent for agent in agents if agent.arrival_s >= _AT_ONCE_S] or agents
@@ -165,7 +170,7 @@ class RoomBudget:
         """Return the part of each agent's delay (N,) that is not the air's, at least what is usual of its
         form, of two the longer: nobody is served before others because it says that it is fast."""
         agents = list(self.agents.values())
-        taken_ms = [1e3 * self._claimed_part * agent.seen_s for agent in agents]
+        taken_ms = [1e3 * self._usual_part * agent.seen_s for agent in agents]
         other_ms = [max(0.0, agent.delay_ms - ms) for agent, ms in zip(agents, taken_ms, strict=True)]
         usual_ms = dict[AgentKind, float]()
         for form in {agent.terms.form for agent in agents}:

@@ -337,3 +337,25 @@ def test_policies_without_a_budget_turn_nobody_away():
     edge = Edge(config, 7)
     now_s = evaluated(edge, [AgentKind.AR] * 20)
     assert refusal(come(edge, "eve", 101, now_s)) is None
+
+
+def test_the_edge_sees_how_long_a_keyframe_takes_to_arrive(monkeypatch):
+    """From the message before it; of a copy, and of what arrives without one before, it learns nothing."""
+    seen = []
+
+    class Recorder(POLICIES["share"]):
+        def evaluate(self, agent, report):
+            seen.append(report.arrival_ms)
+
+    monkeypatch.setitem(POLICIES, "share", Recorder)
+    edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
+    said = m.Evaluation(0, 50.0, 1.0)
+    come(edge, "ann", 1, 0.0)
+    tell(edge, 1, said, 1.0)
+    tell(edge, 1, keyframe(0), 1.05)
+    tell(edge, 1, keyframe(0), 1.3)  # again
+    tell(edge, 1, said, 2.0)
+    tell(edge, 1, m.Ping(1, 1), 2.03)
+    tell(edge, 1, keyframe(1), 2.05)
+    tell(edge, 1, said, 3.0)
+    assert seen == pytest.approx([0.0, 50.0, 20.0])
