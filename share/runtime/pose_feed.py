@@ -227,7 +227,7 @@ class PoseWebSocket:
             raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
         self.host = HostPort(host.name, int(self._listener.getsockname()[1]))
         # a page's request has some kB; a reader then sends an answer to a ping now and then
-        self.peer_connections = PeerConnections(PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10))
+        self._peer_connections = PeerConnections(PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10))
         self._loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
         self._loop.set_exception_handler(self._take_loop_error)
         self._new_message = asyncio.Event()  # replaced at each message
@@ -282,7 +282,7 @@ class PoseWebSocket:
             ping_interval=PING_S,
             ping_timeout=PING_S,
             process_request=self._refuse_excess,
-            create_connection=partial(BoundedConnection, connections=self.peer_connections),
+            create_connection=partial(BoundedConnection, connections=self._peer_connections),
             logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)
@@ -292,7 +292,7 @@ class PoseWebSocket:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSE_S):
                 await server.wait_closed()
-        self.peer_connections.abort_all()
+        self._peer_connections.abort_all()
         await server.wait_closed()
 
     def _signal_new_message(self) -> None:
@@ -301,7 +301,7 @@ class PoseWebSocket:
             self._new_message = asyncio.Event()
 
     def _refuse_excess(self, connection: Any, _request: Any) -> Any:
-        if self.peer_connections.admit(connection):
+        if self._peer_connections.admit(connection):
             return None
         return connection.respond(503, f"{MAX_READERS} readers already\n")
 
