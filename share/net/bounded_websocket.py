@@ -2,7 +2,7 @@
 
 A connection counts from its TCP handshake on, not from its first message. What waits too long, or sends more
 than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets that of one
-that has long had it: who reads for ever cannot be distinguished from who only holds a place. Some places may
+that has long had it: who reads for ever cannot be told apart from who only holds a place. Some places may
 be kept for programs of the server's own machine.
 """
 
@@ -69,10 +69,6 @@ class PeerConnections:
     @property
     def open_count(self) -> int:
         return len(self._open)
-
-    @property
-    def waiting_count(self) -> int:
-        return len(self._waiting)
 
     def arrive(self, connection: BoundedConnection) -> None:
         if len(self._waiting) >= self.limits.max_waiting:

@@ -16,6 +16,7 @@ from share.cli.main import cli
 from share.cli.robot_links import LocalRobot, RobotNews
 from share.errors import ShareError, TransportError, UsageError
 from share.robot import robot_events as ev
+from share.runtime import robot_commands
 from share.runtime.robot_commands import CommandServer, command_path
 
 GOAL_ID = b"SHARE\x00\x00\x01" + b"g" * 8
@@ -106,6 +107,13 @@ def test_cancel():
         result = run("cancel")
         assert (result.exit_code, result.stdout) == (0, "cancelled\n")
         assert served.wait_for(ev.CancelRequested)
+
+
+def test_cancel_that_nobody_answers(monkeypatch):
+    monkeypatch.setattr(robot_commands, "ask_bridge", lambda path, wish: iter(()))
+    result = run("cancel")
+    assert isinstance(result.exception, ShareError)
+    assert str(result.exception) == "the robot was not stopped: the bridge has ended"
 
 
 def test_watch_shows_lines_and_where_the_robot_is():
