@@ -1,15 +1,16 @@
 """Policies where all agents share the air of one access point, in virtual time with modelled mapping.
 
     python tools/experiments/simulate_air.py [--agents 12] [--air shared-5 shared-8] [--seeds 501:511] \\
-        [--policies share covins-g fixed@1.5] [--halved 30:50] [--late 20] [--seconds 60] \\
+        [--policies share covins-g fixed@1.5] [--halved 30:50] [--late 20] [--seconds 60] [--sigma] \\
         [--set SECTION.NAME=VALUE] [--json FILE]
 
 Two headsets per robot walk for a minute in a warehouse that grows with their number; frames at 30 Hz,
 keyframes of 27 kB. `fixed@HZ`: policy fixed at this rate; `random`: other gains by each seed. `--halved A:B`:
-the air has half its rate from A to B s. `--late S`: the second half of the agents comes after S s. Prints two
-Markdown tables (`air_figures`): figures of each policy, means over seeds; and in how many seeds the first
-policy is better than each other. How agents are served is sampled twice a second from the agents themselves,
-from their first keyframe to the end, whether or not the edge hears of it:
+the air has half its rate from A to B s. `--late S`: the second half of the agents comes after S s. `--sigma`:
+agents expect odometry's own sigma of their drift, in place of its true error of the last 5 s, the best that
+an error model can tell. Prints two Markdown tables (`air_figures`): figures of each policy, means over seeds;
+and in how many seeds the first policy is better than each other. How agents are served is sampled twice a
+second from the agents themselves, from their first keyframe to the end, whether or not the edge hears of it:
 
 * QoE of headsets and robots: mean, and the 5th percentile over a run's samples of all headsets; of the
   delay until corrections (a keyframe that is not acknowledged counts as late as it is) and the expected
@@ -138,6 +139,7 @@ def main() -> int:
     parser.add_argument("--halved", metavar="A:B")
     parser.add_argument("--late", type=float, metavar="S")
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--sigma", action="store_true")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -154,7 +156,8 @@ def simulate(options: argparse.Namespace) -> None:
         for air in options.air:
             for policy, config in configs.items():
                 drawn = replace(config, control=replace(config.control, random_seed=seed))
-                rows.append({"policy": policy, **play(made, drawn, air, seed, options.halved, options.late)})
+                ran = play(made, drawn, air, seed, options.halved, options.late, options.sigma)
+                rows.append({"policy": policy, **ran})
                 if options.json:
                     options.json.write_text(json.dumps(rows) + "\n")
     print_tables(rows)
@@ -170,10 +173,13 @@ def with_policy(text: str, settings: list[str]) -> Config:
 
 
 def begin(
-    kind: type[World], made: KeyframeSet, config: Config, air: str, seed: int
+    kind: type[World], made: KeyframeSet, config: Config, air: str, seed: int, by_sigma: bool = False
 ) -> tuple[World, dict[str, Trajectory], float]:
-    """Return a simulation before its first event, the truth of its keyframes, and its duration, s."""
+    """Return a simulation before its first event, the truth of its keyframes, and its duration, s. by_sigma:
+    agents do not know odometry's error."""
     seen, truth, seconds = frames_of_all(made, seed)
+    if by_sigma:
+        seen = [(replace(frame, error_cm=None) for frame in frames) for frames in seen]
     known = truth_of(made, NEAR_M, config.control.far_m)
     mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     network = load_network(air)
@@ -188,11 +194,12 @@ def play(
     seed: int,
     halved: str | None = None,
     late_s: float | None = None,
+    by_sigma: bool = False,
 ) -> Row:
     """Simulate one run."""
     began = time.monotonic()
     who = list(made.agents.values())
-    world, truth, seconds = begin(SampledSimulation, made, config, air, seed)
+    world, truth, seconds = begin(SampledSimulation, made, config, air, seed, by_sigma)
     if halved is not None:
         _halve(world, *map(float, halved.split(":")))
     if late_s is not None:
