@@ -71,7 +71,7 @@ class AgentConfig:
     late_ms: float | None = None  # later frames get a pose from the IMU; 0: none; null: 100, a robot 400
     blend_s: float = 0.5  # time constant with which the pose follows a correction
     finish_s: float = 5.0  # longest wait for acknowledgements at the end of a run
-    error_model: str = "shipped"  # error model: shipped, a file, or "" for odometry's covariance
+    error_model: str = ""  # error model: shipped, a file, or "" for odometry's covariance
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")

@@ -73,7 +73,7 @@ def main() -> None:
     def say(text: str) -> None:
         print(f"{time.monotonic():.1f} {text}", file=sys.stderr, flush=True)
 
-    errors = BackgroundErrorModel(open_error_model(settings.agent.error_model), say)
+    errors = BackgroundErrorModel(open_error_model("shipped"), say)
     hello = Hello(name, AgentKind.AR, run_id, source.rig)
     run = AgentRun(
         source, hello, settings, lambda: connect(address, run_id), Path(out), say, error_estimator=errors

@@ -64,7 +64,7 @@ def main() -> int:
 
 
 def make(options: argparse.Namespace) -> None:
-    for number in range(options.first, options.first + options.room_log_sigma):
+    for number in range(options.first, options.first + options.rooms):
         out = options.out / f"{_PREFIX[options.sensors]}-{number:03d}"
         if not out.exists():
             print(out.name, file=sys.stderr, flush=True)

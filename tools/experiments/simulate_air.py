@@ -1,23 +1,27 @@
 """Policies where all agents share the air of one access point, in virtual time with modelled mapping.
 
     python tools/experiments/simulate_air.py [--agents 12] [--air shared-5 shared-8] [--seeds 501:511] \\
-        [--policies share covins-g fixed@1.5] [--halved 30:50] [--late 20] [--seconds 60] \\
+        [--policies share covins-g fixed@1.5] [--halved 30:50] [--late 20] [--seconds 60] [--sigma] \\
         [--set SECTION.NAME=VALUE] [--json FILE]
 
 Two headsets per robot walk for a minute in a warehouse that grows with their number; frames at 30 Hz,
-keyframes of 27 kB. `fixed@HZ`: policy fixed at this rate. `--halved A:B`: the air has half its rate from A to
-B s. `--late S`: the second half of the agents comes after S s. Prints a Markdown table, means over seeds. How
-agents are served is sampled twice a second from the agents themselves, from their first keyframe to the end,
-whether or not the edge hears of it:
+keyframes of 27 kB. `fixed@HZ`: policy fixed at this rate; `random`: other gains by each seed. `--halved A:B`:
+the air has half its rate from A to B s. `--late S`: the second half of the agents comes after S s. `--sigma`:
+agents expect odometry's own sigma of their drift, in place of its true error of the last 5 s, the best that
+an error model can tell. Prints two Markdown tables (`air_figures`): figures of each policy, means over seeds;
+and in how many seeds the first policy is better than each other. How agents are served is sampled twice a
+second from the agents themselves, from their first keyframe to the end, whether or not the edge hears of it:
 
 * QoE of headsets and robots: mean, and the 5th percentile over a run's samples of all headsets; of the
   delay until corrections (a keyframe that is not acknowledged counts as late as it is) and the expected
   error. `by round trip`: of headsets, with round trip and processing as delay, or how long a keyframe has
   not been acknowledged, if longer: that of earlier figures.
-* corrections of headsets, 95th percentile, ms; age of a headset's newest correction, 95th percentile, s.
+* corrections of headsets, 95th percentile, ms; ages of a headset's newest correction, 95th percentile, and of
+  its newest pose at the edge, 99th, s; when it is in a map with another agent, s after its start.
 * Jain's index of headsets' QoE: 1 where all are served alike. Corrections a hundred frames of headsets: to
   send nothing would be best by the mean latency.
-* error of poses in the shared map, cm rms; keyframes a second of all; load of the air.
+* error of poses in the shared map, cm rms (maps aligned to the truth once, for all agents in them); keyframes
+  a second; all bytes of messages, both ways, kB/s; share of time in which the air is busy.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ import json
 import math
 import sys
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,48 +41,40 @@ from share import startup
 startup.prepare_process()
 
 import numpy as np  # noqa: E402
+from air_figures import Row, print_tables  # noqa: E402
 from keyframe_set import KeyframeSet  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from modelled_mapper import ModelledMapper, RecognitionModel  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
 from simulate import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
-from tool_main import exit_code, line  # noqa: E402
+from tool_main import exit_code  # noqa: E402
 
 from share.config import NEAR_M, Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.lab.evaluate.emulated_network import load_network  # noqa: E402
 from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
-from share.lab.evaluate.simulation import Simulation  # noqa: E402
+from share.lab.evaluate.simulation import SimulatedRun, Simulation  # noqa: E402
 from share.protocol import agent_events as ev  # noqa: E402
 from share.protocol.agent import Agent  # noqa: E402
 from share.scheduling.qoe import QoeParameters, qoe  # noqa: E402
 from share.types import AgentKind  # noqa: E402
+from share.wire.messages import Evaluation  # noqa: E402
 
-HEAD = ("air", "policy", "AR QoE: mean, p5", "by round trip", "robot QoE", "AR corrections p95, ms")
-HEAD += (
-    "Jain",
-    "a 100 frames",
-    "AR age p95, s",
-    "cm: AR, robots",
-    "sent Hz: AR, robots",
-    "air",
-    "maps",
-    "took s",
-)
 _SAMPLE_TICKS = 10  # of 50 ms
-
-Row = dict[str, Any]
 
 
 class SampledSimulation(Simulation):
     """A simulation that samples how agents are served. samples: by agent, (t_s, delay, round trip and
-    processing, ms, error, cm, rate, Hz or NaN, age of its newest correction, s)."""
+    processing, ms, error, cm, rate, Hz or NaN, age of its newest correction, and of its newest pose at the
+    edge, s). shared_s: when each was first seen in a map with another. bytes: of all messages so far."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         self.samples: dict[str, list[tuple[float, ...]]] = {}
         self.arrivals_s: dict[str, float] = {}  # of agents that are late
         self._corrected_s: dict[str, float] = {}
+        self.shared_s: dict[str, float] = {}
+        self.bytes = 0
         self._ticks = 0
         super().__init__(*arguments, **{**named, "on_effect": self._note})
 
@@ -88,14 +85,33 @@ class SampledSimulation(Simulation):
     def _tick(self) -> None:
         self._ticks += 1
         if self._ticks % _SAMPLE_TICKS == 0:
+            poses = self.edge.latest_poses()
+            stamps_ns = {key.rpartition("-")[0]: pose.stamp_ns for key, pose in poses.items()}
             for member in self._members.values():
                 if (found := member.machine.evaluation(-1, self.now_ns)) is not None:
-                    now_s, hz = 1e-9 * self.now_ns, member.machine.report()["rate_hz"]
-                    trip_ms = max(found.rtt_ms + found.track_ms, _waiting_ms(member.machine, self.now_ns))
-                    sampled = now_s, found.delay_ms, trip_ms, found.error_cm or math.nan
-                    age_s = now_s - self._corrected_s.get(member.name, self.arrivals_s.get(member.name, 0.0))
-                    self.samples.setdefault(member.name, []).append((*sampled, hz or math.nan, age_s))
+                    self._sample(member, found, stamps_ns.get(member.name))
+            self._note_shared_maps()
         super()._tick()
+
+    def _sample(self, member: SimulatedRun, found: Evaluation, pose_ns: int | None) -> None:
+        now_s, began_s = 1e-9 * self.now_ns, self.arrivals_s.get(member.name, 0.0)
+        hz = member.machine.report()["rate_hz"]
+        trip_ms = max(found.rtt_ms + found.track_ms, _waiting_ms(member.machine, self.now_ns))
+        age_s = now_s - self._corrected_s.get(member.name, began_s)
+        pose_s = now_s - (began_s if pose_ns is None else 1e-9 * pose_ns)
+        sampled = now_s, found.delay_ms, trip_ms, found.error_cm or math.nan, hz or math.nan, age_s, pose_s
+        self.samples.setdefault(member.name, []).append(sampled)
+
+    def _note_shared_maps(self) -> None:
+        maps = {member.name: member.machine.report()["map_id"] for member in self._members.values()}
+        count = Counter(map_id for map_id in maps.values() if map_id is not None)
+        for name, map_id in maps.items():
+            if count[map_id] > 1:
+                self.shared_s.setdefault(name, 1e-9 * self.now_ns)
+
+    def _over_the_air(self, member: Any, station: str, size: int, done: Any) -> None:
+        self.bytes += size
+        super()._over_the_air(member, station, size, done)
 
     def _to_agent(self, member: Any, event: ev.AgentEvent) -> None:
         if 1e-9 * self.now_ns >= self.arrivals_s.get(member.name, 0.0):
@@ -123,6 +139,7 @@ def main() -> int:
     parser.add_argument("--halved", metavar="A:B")
     parser.add_argument("--late", type=float, metavar="S")
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--sigma", action="store_true")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -138,13 +155,12 @@ def simulate(options: argparse.Namespace) -> None:
         made = scarce_room(options.agents, seed, options.seconds)
         for air in options.air:
             for policy, config in configs.items():
-                rows.append({"policy": policy, **play(made, config, air, seed, options.halved, options.late)})
+                drawn = replace(config, control=replace(config.control, random_seed=seed))
+                ran = play(made, drawn, air, seed, options.halved, options.late, options.sigma)
+                rows.append({"policy": policy, **ran})
                 if options.json:
                     options.json.write_text(json.dumps(rows) + "\n")
-    print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))))
-    for air in options.air:
-        for policy in configs:
-            print(line(cells_of([row for row in rows if (row["air"], row["policy"]) == (air, policy)])))
+    print_tables(rows)
 
 
 def with_policy(text: str, settings: list[str]) -> Config:
@@ -157,10 +173,13 @@ def with_policy(text: str, settings: list[str]) -> Config:
 
 
 def begin(
-    kind: type[World], made: KeyframeSet, config: Config, air: str, seed: int
+    kind: type[World], made: KeyframeSet, config: Config, air: str, seed: int, by_sigma: bool = False
 ) -> tuple[World, dict[str, Trajectory], float]:
-    """Return a simulation before its first event, the truth of its keyframes, and its duration, s."""
+    """Return a simulation before its first event, the truth of its keyframes, and its duration, s. by_sigma:
+    agents do not know odometry's error."""
     seen, truth, seconds = frames_of_all(made, seed)
+    if by_sigma:
+        seen = [(replace(frame, error_cm=None) for frame in frames) for frames in seen]
     known = truth_of(made, NEAR_M, config.control.far_m)
     mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     network = load_network(air)
@@ -175,11 +194,12 @@ def play(
     seed: int,
     halved: str | None = None,
     late_s: float | None = None,
+    by_sigma: bool = False,
 ) -> Row:
     """Simulate one run."""
     began = time.monotonic()
     who = list(made.agents.values())
-    world, truth, seconds = begin(SampledSimulation, made, config, air, seed)
+    world, truth, seconds = begin(SampledSimulation, made, config, air, seed, by_sigma)
     if halved is not None:
         _halve(world, *map(float, halved.split(":")))
     if late_s is not None:
@@ -192,6 +212,7 @@ def play(
         "agents": {a.hello.name: _agent_row(world, a.hello.name, config) for a in who},
         "error_cm": shared_errors(world.localised, truth),
         "busy": sum(one.busy_ns for one in world.airs.values()) / world.now_ns,
+        "bytes": world.bytes,
         "maps": len({own["map_id"] for own in world.mapper.report()["agents"].values()}),
         "mapper": world.mapper_busy_ns / world.now_ns,
         "took_s": time.monotonic() - began,
@@ -207,10 +228,10 @@ def _halve(world: SampledSimulation, begin_s: float, end_s: float) -> None:
 def _agent_row(world: SampledSimulation, name: str, config: Config) -> Row:
     kind = AgentKind.AR if name.startswith("ar") else AgentKind.ROBOT
     terms = QoeParameters.from_config(config.control, kind)
-    samples = np.array(world.samples.get(name, [])).reshape(-1, 6)
+    samples = np.array(world.samples.get(name, [])).reshape(-1, 7)
     corrected_ms = world.logs[name].frames().corrected_ms
     columns = zip(*samples.T.tolist(), strict=True)
-    rated = [(qoe(d, _known(e), terms), qoe(trip, _known(e), terms)) for _, d, trip, e, _, _ in columns]
+    rated = [(qoe(d, _known(e), terms), qoe(trip, _known(e), terms)) for _, d, trip, e, *_ in columns]
     return {
         "qoe": [each for each, _ in rated],
         "qoe_by_round_trip": [each for _, each in rated],
@@ -219,6 +240,8 @@ def _agent_row(world: SampledSimulation, name: str, config: Config) -> Row:
         "expected_cm": samples[:, 3].tolist(),
         "rate_hz": samples[:, 4].tolist(),
         "age_s": samples[:, 5].tolist(),
+        "pose_s": samples[:, 6].tolist(),
+        "shared_s": world.shared_s.get(name, math.inf) - world.arrivals_s.get(name, 0.0),
         "corrected_ms": corrected_ms[corrected_ms > 0].tolist(),
         "sent": world.reports()[name]["sent"],
         "frames": len(world.logs[name].frames().corrected_ms),
@@ -227,66 +250,6 @@ def _agent_row(world: SampledSimulation, name: str, config: Config) -> Row:
 
 def _known(error_cm: float) -> float | None:
     return None if math.isnan(error_cm) else error_cm
-
-
-def pooled(row: Row, kind: str, figure: str) -> np.ndarray[Any, Any]:
-    """Return a figure of all agents of a kind in one run, joined."""
-    found = [np.atleast_1d(a[figure]) for name, a in row["agents"].items() if name.startswith(kind)]
-    return np.concatenate(found) if found else np.array([math.nan])
-
-
-def mean_qoe(row: Row, kind: str) -> np.ndarray[Any, Any]:
-    """Return the mean QoE of each agent of a kind that was there."""
-    found = [agent["qoe"] for name, agent in row["agents"].items() if name.startswith(kind) and agent["qoe"]]
-    return np.array([np.mean(qoe) for qoe in found])
-
-
-def jain(values: np.ndarray[Any, Any]) -> float:
-    """Return Jain's fairness index (R. Jain, D. Chiu, W. Hawe, DEC-TR-301, 1984): 1 where all are equal, 1/n
-    where one has everything; NaN of none."""
-    square = len(values) * float((values**2).sum())
-    return float(values.sum()) ** 2 / square if square else math.nan
-
-
-def corrections_a_100_frames(row: Row) -> float:
-    """Return how many of a hundred frames of headsets led to a correction."""
-    return float(100 * len(pooled(row, "ar", "corrected_ms")) / max(1, pooled(row, "ar", "frames").sum()))
-
-
-def cells_of(rows: list[Row]) -> list[str]:
-    """Return the cells of the runs of one policy on one air."""
-
-    def over_runs(of_run: Any) -> float:
-        return float(np.nanmean([of_run(row) for row in rows]))
-
-    def sent_hz(row: Row, kind: str) -> float:
-        return float(pooled(row, kind, "sent").mean()) / row["seconds"]
-
-    def p95(values: np.ndarray[Any, Any]) -> float:
-        return float(np.percentile(values, 95)) if len(values) else math.nan
-
-    def error_cm(row: Row, kind: str) -> float:
-        found = [cm for name, cm in row["error_cm"].items() if name.startswith(kind)]
-        return float(np.mean(found)) if found else math.nan
-
-    return [
-        rows[0]["air"],
-        rows[0]["policy"],
-        f"{over_runs(lambda r: pooled(r, 'ar', 'qoe').mean()):.3f}, "
-        f"{over_runs(lambda r: np.percentile(pooled(r, 'ar', 'qoe'), 5)):.3f}",
-        f"{over_runs(lambda r: pooled(r, 'ar', 'qoe_by_round_trip').mean()):.3f}, "
-        f"{over_runs(lambda r: np.percentile(pooled(r, 'ar', 'qoe_by_round_trip'), 5)):.3f}",
-        f"{over_runs(lambda r: pooled(r, 'robot', 'qoe').mean()):.3f}",
-        f"{over_runs(lambda r: p95(pooled(r, 'ar', 'corrected_ms'))):.0f}",
-        f"{over_runs(lambda r: jain(mean_qoe(r, 'ar'))):.3f}",
-        f"{over_runs(corrections_a_100_frames):.2f}",
-        f"{over_runs(lambda r: p95(pooled(r, 'ar', 'age_s'))):.1f}",
-        f"{over_runs(lambda r: error_cm(r, 'ar')):.2f}, {over_runs(lambda r: error_cm(r, 'robot')):.2f}",
-        f"{over_runs(lambda r: sent_hz(r, 'ar')):.2f}, {over_runs(lambda r: sent_hz(r, 'robot')):.2f}",
-        f"{over_runs(lambda r: r['busy']):.2f}",
-        f"{over_runs(lambda r: r['maps']):.1f}",
-        f"{over_runs(lambda r: r['took_s']):.0f}",
-    ]
 
 
 if __name__ == "__main__":

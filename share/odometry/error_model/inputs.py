@@ -78,6 +78,11 @@ def tracking_score(sigma_cm: float) -> float:
     return math.log10(max(sigma_cm, _MIN_SIGMA_CM) / _MIN_SIGMA_CM) / _SIGMA_DECADES
 
 
+def sigma_of_score(score: float) -> float:
+    """Return the sigma of a tracking score, cm."""
+    return _MIN_SIGMA_CM * 10.0 ** (_SIGMA_DECADES * score)
+
+
 def _log_count(count: int) -> float:
     return math.log1p(count) / math.log1p(COUNT_SCALE)
 
