@@ -284,7 +284,7 @@ class PoseWebSocket:
             ping_interval=PING_S,
             ping_timeout=PING_S,
             process_request=self._refuse_excess,
-            create_connection=partial(BoundedConnection, connections=self._peer_connections),
+            create_connection=partial(BoundedConnection, connections=self.peer_connections),
             logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)
@@ -294,7 +294,7 @@ class PoseWebSocket:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSE_S):
                 await server.wait_closed()
-        self._peer_connections.abort_all()
+        self.peer_connections.abort_all()
         await server.wait_closed()
 
     def _signal_new_message(self) -> None:
@@ -303,7 +303,7 @@ class PoseWebSocket:
             self._new_message = asyncio.Event()
 
     def _refuse_excess(self, connection: Any, _request: Any) -> Any:
-        if self._peer_connections.admit(connection):
+        if self.peer_connections.admit(connection):
             return None
         return connection.respond(503, f"{MAX_READERS} readers already\n")
 

@@ -127,7 +127,7 @@ def test_idle_connections_make_no_thread_and_keep_nobody_out(served):
         assert threading.active_count() == threads
         with connected(served) as reader:
             assert gets_poses(served, reader)
-        assert len(served._peer_connections._waiting) <= 32
+        assert len(served.peer_connections._waiting) <= 32
 
 
 def test_too_many_readers_are_refused_before_they_are_served(served):
@@ -136,7 +136,7 @@ def test_too_many_readers_are_refused_before_they_are_served(served):
             stack.enter_context(connected(served))
         with pytest.raises(exceptions.InvalidStatus, match="503"):
             client.connect(f"ws://{served.host}", proxy=None)
-        assert served._peer_connections.open_count == MAX_READERS
+        assert served.peer_connections.open_count == MAX_READERS
     with connected(served) as reader:  # the places are free again
         assert gets_poses(served, reader)
 
@@ -165,7 +165,7 @@ def test_readers_of_one_machine_do_not_keep_out_those_of_another(served):
         with client.connect(f"ws://{served.host}", sock=from_address(served, "127.0.0.2")) as other:
             assert is_disconnected(first)
             assert gets_poses(served, other)
-            assert served._peer_connections.open_count == MAX_READERS
+            assert served.peer_connections.open_count == MAX_READERS
         with connected(served), pytest.raises(exceptions.InvalidStatus, match="503"):
             client.connect(f"ws://{served.host}", proxy=None)  # nobody else of its own address goes
 
@@ -178,7 +178,7 @@ def test_a_reader_that_has_long_read_gives_its_place_to_a_newcomer(served, monke
         with client.connect(f"ws://{served.host}", proxy=None) as newcomer:
             assert is_disconnected(first)
             assert gets_poses(served, newcomer) and gets_poses(served, second)
-            assert served._peer_connections.open_count == MAX_READERS
+            assert served.peer_connections.open_count == MAX_READERS
 
 
 def test_readers_of_other_machines_leave_places_to_programs_of_this_one(served, monkeypatch):
