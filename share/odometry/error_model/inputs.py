@@ -80,7 +80,7 @@ def tracking_score(sigma_cm: float) -> float:
 
 def sigma_of_score(score: float) -> float:
     """Return the sigma of a tracking score, cm."""
-    return _MIN_SIGMA_CM * 10.0 ** (_SIGMA_DECADES * score)
+    return float(_MIN_SIGMA_CM * 10.0 ** (_SIGMA_DECADES * score))
 
 
 def _log_count(count: int) -> float:
