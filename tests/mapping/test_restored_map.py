@@ -114,6 +114,7 @@ def test_a_restored_mapper_has_the_same_maps_and_continues(tmp_path: Path, most:
     assert second.mapper.report()["loops"]["accepted"] > 0
 
 
+@pytest.mark.long
 def test_keyframes_that_show_what_is_gone_are_removed_with_the_next_one(tmp_path: Path) -> None:
     """Also from the file; what a new keyframe stands for is compared only where it is from today."""
     session, people = after_a_walk(Config())

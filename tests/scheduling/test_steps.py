@@ -64,6 +64,7 @@ def test_a_pause_of_the_edge() -> None:
     assert air.history[-1] == pytest.approx(before, abs=_STEP_HZ)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("alone_ms", [9.0, 12.0, 15.0, 18.0, 34.0])
 def test_what_each_measures_is_noisy_and_rates_stand_all_the_same(alone_ms: float) -> None:
     """Keyframes take 25 % more or less, robots want 5 Hz: where the air is just short rates do not swing."""
