@@ -191,8 +191,9 @@ def _stereo_pairs(indices: I64) -> tuple[I64, I64]:
 
 def _runs(anchor: I64) -> tuple[I64, I64, I64]:
     """Return value, start and end of each run of equal values."""
-    first = np.flatnonzero(np.r_[True, anchor[1:] != anchor[:-1]]) if len(anchor) else np.zeros(0, np.int64)
-    return anchor[first], first, np.r_[first[1:], len(anchor)]
+    bounds = np.flatnonzero(anchor[1:] != anchor[:-1]) + 1
+    first = np.concatenate([[0], bounds]) if len(anchor) else bounds
+    return anchor[first], first, np.concatenate([bounds, [len(anchor)]]) if len(anchor) else bounds
 
 
 def nis(rows: FeatureMeasurements, S: FloatArray) -> F64:
