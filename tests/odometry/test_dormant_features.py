@@ -38,9 +38,7 @@ def room(counts: list[int], sigma: float = KNOWN) -> FilterState:
         index = state.add_keyframe(s, k, np.zeros(3))
         ray = np.random.default_rng(k).uniform(-0.3, 0.3, (count, 2))
         ids = np.arange(first, first + count)
-        state.add_features(
-            s, ids, np.full(count, index), ray, np.full(count, 0.2), sigma * (1 + ids * 1e-3)
-        )
+        state.add_features(s, ids, np.full(count, index), ray, np.full(count, 0.2), sigma * (1 + ids * 1e-3))
         first += count
     return s
 
@@ -97,7 +95,7 @@ def test_a_keyframe_keeps_its_most_certain_forty():
     assert found_ids(dormant, s) == list(range(40))
 
 
-@pytest.mark.parametrize("age, sigma, is_kept", [(9, KNOWN, True), (4, KNOWN, False), (9, 0.02, False)])
+@pytest.mark.parametrize(("age", "sigma", "is_kept"), [(9, KNOWN, True), (4, KNOWN, False), (9, 0.02, False)])
 def test_only_features_seen_often_with_a_known_depth_are_kept(age, sigma, is_kept):
     dormant, s = DormantFeatures(), room([1], sigma)
     appearance = replace(appearance_of(s.feature_ids), age=np.array([age]))
