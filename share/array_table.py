@@ -1,4 +1,4 @@
-"""Tables as dataclasses of arrays with one row per item: selection and concatenation of rows."""
+"""Tables as dataclasses of arrays with one row per item: selection, concatenation and replacement of rows."""
 
 from __future__ import annotations
 
@@ -26,6 +26,15 @@ class ArrayTable:
         return type(self)(
             *[_concatenate([getattr(t, name) for t in tables]) for name in _field_names(type(self))]
         )
+
+    def put(self, rows: I64, values: Self) -> None:
+        """Overwrite these rows with those of `values`, in place."""
+        for name in _field_names(type(self)):
+            mine, others = getattr(self, name), getattr(values, name)
+            if isinstance(mine, ArrayTable):
+                mine.put(rows, others)
+            else:
+                mine[rows] = others
 
 
 _FIELD_NAMES: dict[type[ArrayTable], tuple[str, ...]] = {}  # cache

@@ -20,6 +20,7 @@ _SIGMA_INFLATION = 1.5  # times its sigma, because its correlation with the pose
 _MAX_PER_KEYFRAME = 40  # features
 _MAX_SEARCHED = 80  # that a keyframe searches for again,
 _MAX_DISTANCE_M, _MAX_ANGLE_RAD = 1.5, 0.7  # of keyframes at most so far away
+_FREE = -1  # keyframe of a row without a feature
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,100 +37,92 @@ class DormantTable(ArrayTable):
 
 
 class DormantFeatures:
-    """Dormant features by the id of their anchor keyframe. Memory is bounded by the number of keyframes in
-    the state."""
+    """Dormant features in the rows of one table, whose free rows are used again: patches are copied once in
+    and once out. Memory is bounded by the number of keyframes in the state."""
 
     def __init__(self) -> None:
-        self._by_keyframe: dict[int, list[DormantTable]] = {}  # oldest first
-        # Anchor ids and features, grouped by keyframe only when needed.
-        self._unsorted: list[tuple[I64, DormantTable]] = []
+        self._table: DormantTable | None = None
+        # Of each row: id of the anchor keyframe, or `_FREE`; when it came, by which rows are ordered.
+        self._keyframe, self._number = np.zeros((2, 0), np.int64)
+        self._next_number = 0
 
     def deactivate(self, state: FilterState, appearance: Appearance, indices: I64) -> None:
         """Keep features `indices` of the state if their depth is well known."""
+        if not len(indices):
+            return
         sigma = _SIGMA_INFLATION * np.sqrt(state.rho_variance[indices])
         is_known = (sigma < _MAX_RELATIVE_SIGMA * np.abs(state.rho[indices])) | (sigma < 0.003)
         is_known &= appearance.age[indices] >= 5
-        indices_kept = indices[is_known]
-        if len(indices_kept):
-            anchors, appearance_kept = state.anchor[indices_kept], appearance.take(indices_kept)
-            dormant = DormantTable(
-                state.feature_ids[indices_kept],
-                anchors,
-                state.ray[indices_kept],
-                state.rho[indices_kept],
-                sigma[is_known],
-                appearance_kept,
-            )
-            self._unsorted.append((state.keyframe_ids[anchors], dormant))
-
-    def _group_by_keyframe(self) -> None:
-        """Move `_unsorted` into `_by_keyframe`."""
-        if not self._unsorted:
+        kept = indices[is_known]
+        if not len(kept):
             return
-        keys = np.concatenate([keys for keys, _ in self._unsorted])
-        first, *others = (dormant for _, dormant in self._unsorted)
-        new, self._unsorted = first.concatenate(*others), []
-        for key in np.unique(keys).tolist():
-            self._by_keyframe.setdefault(key, []).append(new.take(keys == key))
+        anchor = state.anchor[kept]
+        dormant = DormantTable(
+            state.feature_ids[kept],
+            anchor,
+            state.ray[kept],
+            state.rho[kept],
+            sigma[is_known],
+            appearance.take(kept),
+        )
+        self._add(dormant, state.keyframe_ids[anchor])
 
-    def _most_certain(self, keyframe: int) -> DormantTable | None:
-        """Return the dormant features of one keyframe, reduced to the most certain ones; None without any."""
-        if keyframe not in self._by_keyframe:
-            return None
-        first, *others = self._by_keyframe[keyframe]
-        dormant = first.concatenate(*others) if others else first
-        if len(dormant.ids) > _MAX_PER_KEYFRAME:
-            best = np.argsort(dormant.sigma, kind="stable")[:_MAX_PER_KEYFRAME]
-            dormant = dormant.take(np.sort(best))
-        self._by_keyframe[keyframe] = [dormant]
-        return dormant
+    def _add(self, dormant: DormantTable, keyframe_ids: I64) -> None:
+        count = len(dormant.ids)
+        free = np.flatnonzero(self._keyframe == _FREE)[:count]
+        if len(free) < count or self._table is None:
+            grown = dormant if self._table is None else self._table.concatenate(self._table, dormant)
+            added = len(grown.ids) - len(self._keyframe)
+            self._keyframe = np.concatenate([self._keyframe, np.full(added, _FREE)])
+            self._number = np.concatenate([self._number, np.zeros(added, np.int64)])
+            self._table, free = grown, np.flatnonzero(self._keyframe == _FREE)[:count]
+        self._table.put(free, dormant)
+        self._keyframe[free] = keyframe_ids
+        self._number[free] = np.arange(self._next_number, self._next_number + count)
+        self._next_number += count
 
     def has_features(self, keyframe_ids: I64) -> NDArray[np.bool_]:
         """Return which keyframes (K,) have dormant features."""
-        self._group_by_keyframe()
-        return np.isin(keyframe_ids, list(self._by_keyframe))
+        return np.isin(keyframe_ids, self._keyframe)
 
     def drop_keyframes(self, keyframe_ids: I64) -> None:
         """Forget the features of these keyframes."""
-        self._group_by_keyframe()
-        for keyframe_id in keyframe_ids.tolist():
-            self._by_keyframe.pop(keyframe_id, None)
+        self._keyframe[np.isin(self._keyframe, keyframe_ids)] = _FREE
+
+    def reactivate(self, ids: I64) -> None:
+        """Remove the features with these ids: they are in the state again."""
+        if self._table is not None:
+            self._keyframe[np.isin(self._table.ids, ids)] = _FREE
 
     def nearby(self, state: FilterState, camera: Camera) -> DormantTable | None:
         """Return features that the camera should see, of the nearest keyframes first; None without any.
 
         `anchor` is the index in the state.
         """
-        self._group_by_keyframe()
         (distance,), (angle,) = se3.pairwise_distances(state.T[None], state.keyframe_poses)
-        out: list[DormantTable] = []
-        for k in np.argsort(distance + angle, kind="stable").tolist():
-            if distance[k] >= _MAX_DISTANCE_M or angle[k] >= _MAX_ANGLE_RAD:
-                continue
+        is_near = (distance < _MAX_DISTANCE_M) & (angle < _MAX_ANGLE_RAD)
+        nearest = np.argsort(distance + angle, kind="stable")
+        rows, anchor = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        for k in nearest[is_near[nearest]].tolist():
             candidates = self._most_certain(int(state.keyframe_ids[k]))
-            if candidates is None:
+            if self._table is None or not len(candidates):
                 continue
-            candidates = candidates.take(
-                feature_matching.is_in_view(state, camera, k, candidates.ray, candidates.rho)
-            )
-            if len(candidates.ids) == 0:
-                continue
-            out.append(replace(candidates, anchor=np.full(len(candidates.ids), k)))
-            if sum(len(table.ids) for table in out) >= _MAX_SEARCHED:
+            ray, rho = self._table.ray[candidates], self._table.rho[candidates]
+            rows.append(candidates[feature_matching.is_in_view(state, camera, k, ray, rho)])
+            anchor.append(np.full(len(rows[-1]), k))
+            if sum(map(len, rows)) >= _MAX_SEARCHED:
                 break
-        return out[0].concatenate(*out[1:]) if out else None
+        found = np.concatenate(rows)
+        if self._table is None or not len(found):
+            return None
+        return replace(self._table.take(found), anchor=np.concatenate(anchor))
 
-    def reactivate(self, ids: I64) -> None:
-        """Remove the features with these ids: they are in the state again."""
-        self._group_by_keyframe()
-        reactivated = set(ids.tolist())
-        for keyframe, parts in list(self._by_keyframe.items()):
-            remaining = [_without_ids(part, reactivated) for part in parts]
-            self._by_keyframe[keyframe] = [part for part in remaining if len(part.ids)]
-            if not self._by_keyframe[keyframe]:
-                del self._by_keyframe[keyframe]
-
-
-def _without_ids(dormant: DormantTable, ids: set[int]) -> DormantTable:
-    keep = [n for n, feature in enumerate(dormant.ids.tolist()) if feature not in ids]
-    return dormant if len(keep) == len(dormant.ids) else dormant.take(np.array(keep, np.int64))
+    def _most_certain(self, keyframe_id: int) -> I64:
+        """Return the rows of the most certain features of one keyframe, oldest first; free the others."""
+        rows = np.flatnonzero(self._keyframe == keyframe_id)
+        rows = rows[np.argsort(self._number[rows])]
+        if self._table is not None and len(rows) > _MAX_PER_KEYFRAME:
+            by_sigma = np.argsort(self._table.sigma[rows], kind="stable")
+            self._keyframe[rows[by_sigma[_MAX_PER_KEYFRAME:]]] = _FREE
+            rows = rows[np.sort(by_sigma[:_MAX_PER_KEYFRAME])]
+        return rows

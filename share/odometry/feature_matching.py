@@ -170,10 +170,13 @@ def _scatter(values: F64, indices: I64, out: F64) -> F64:
 
 def _solved(J: F64, b: F64) -> F64:
     """Return x (N, 2) with J x = b for J (N, 2, 2), b (N, 2); not finite where J is singular."""
-    (p, q), (r, s) = np.moveaxis(J, 0, 2)
-    x, y = b.T
+    p, q, r, s = J[:, 0, 0], J[:, 0, 1], J[:, 1, 0], J[:, 1, 1]
+    x, y = b[:, 0], b[:, 1]
+    out = np.empty((len(J), 2))
     with np.errstate(divide="ignore", invalid="ignore"):
-        out: F64 = np.stack([s * x - q * y, p * y - r * x], axis=1) / (p * s - q * r)[:, None]
+        determinant = p * s - q * r
+        np.divide(s * x - q * y, determinant, out=out[:, 0])
+        np.divide(p * y - r * x, determinant, out=out[:, 1])
     return out
 
 

@@ -191,8 +191,9 @@ def _stereo_pairs(indices: I64) -> tuple[I64, I64]:
 
 def _runs(anchor: I64) -> tuple[I64, I64, I64]:
     """Return value, start and end of each run of equal values."""
-    first = np.flatnonzero(np.r_[True, anchor[1:] != anchor[:-1]]) if len(anchor) else np.zeros(0, np.int64)
-    return anchor[first], first, np.r_[first[1:], len(anchor)]
+    bounds = np.flatnonzero(anchor[1:] != anchor[:-1]) + 1
+    first = np.concatenate([[0], bounds]) if len(anchor) else bounds
+    return anchor[first], first, np.concatenate([bounds, [len(anchor)]]) if len(anchor) else bounds
 
 
 def nis(rows: FeatureMeasurements, S: FloatArray) -> F64:
@@ -336,9 +337,15 @@ def relative_pose_cov(state: FilterState, a: int, b: int) -> F64:
 def relative_poses(state: FilterState, indices: I64, b: int) -> tuple[F64, F64]:
     """Return T_a_b (M, 4, 4) from the keyframes with `indices` (M,) to keyframe b, with covariances (M, 6,
     6), perturbed on the right."""
-    T = se3.orthonormal(se3.inverse(state.keyframe_poses[indices]) @ state.keyframe_poses[b])
-    covs = [relative_pose_cov(state, int(a), b) for a in indices]
-    return T, np.array(covs).reshape(-1, 6, 6)
+    T_a_b = se3.orthonormal(se3.inverse(state.keyframe_poses[indices]) @ state.keyframe_poses[b])
+    P, columns_b = state.cov, state.keyframe_columns(b)
+    columns = KEYFRAMES_START + 6 * indices[:, None] + np.arange(6)
+    P_ab = P[:, columns_b][columns]
+    difference = P[columns[:, :, None], columns[:, None, :]] + P[columns_b, columns_b]
+    difference -= P_ab + P_ab.swapaxes(1, 2)
+    Ad = se3.adjoint(se3.inverse(state.keyframe_poses[b]))
+    out = Ad @ difference @ Ad.T
+    return T_a_b, (out + out.swapaxes(1, 2)) / 2 + _MIN_VARIANCE * np.eye(6)
 
 
 def motion_cov_since_keyframe(state: FilterState) -> F64:
