@@ -21,9 +21,9 @@ def test_a_folder_named_share_in_the_working_directory_is_ignored(tmp_path):
 def test_a_child_that_does_not_end_is_killed_and_that_is_what_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(real_time, "_STOP_S", 0.5)
     code = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); print(flush=True); time.sleep(60)"
-    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    child.stdout.readline()
-    assert real_time.stop_child(child) == -signal.SIGKILL
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as child:
+        child.stdout.readline()
+        assert real_time.stop_child(child) == -signal.SIGKILL
     log = tmp_path / "edge.log"
     log.write_text("   55.912 s left: robot: sent bye\n")
     assert real_time._why_it_failed(1, log) == "   55.912 s left: robot: sent bye"
