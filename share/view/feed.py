@@ -1,8 +1,8 @@
 """Bounded queue from the edge to the live room. It never blocks the edge; when full it drops its oldest.
 
-The edge's loop only appends values that it has anyway, and wakes nobody; of poses, reports and refusals the newest is
-kept. A thread looks fifteen times a second, makes events of them and sends them to the viewer's process; if that is
-slow, this thread waits, and the queue drops.
+The edge's loop only appends values that it has anyway, and wakes nobody; of poses, reports and refusals the
+newest is kept. A thread looks fifteen times a second, makes events of them and sends them to the viewer's
+process; if that is slow, this thread waits, and the queue drops.
 """
 
 from __future__ import annotations

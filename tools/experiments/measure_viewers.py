@@ -201,8 +201,8 @@ def _difference(values: list[float], digits: int) -> str:
 
 
 def median_interval(values: Sequence[float], least: float = 0.9) -> tuple[float, float]:
-    """Return the narrowest pair of order statistics that hold the median with at least this probability, whatever
-    the distribution; the extremes where there are too few for it."""
+    """Return the narrowest pair of order statistics that hold the median with at least this probability,
+    whatever the distribution; the extremes where there are too few for it."""
     ordered = sorted(values)
     n, outside, k = len(ordered), 0.0, 0
     while k < n // 2 and outside + 2 * comb(n, k) / 2**n <= 1 - least:

@@ -20,7 +20,7 @@ def test_a_folder_named_share_in_the_working_directory_is_ignored(tmp_path):
 
 def test_a_child_that_does_not_end_is_killed_and_that_is_what_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(real_time, "_STOP_S", 0.5)
-    code = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); print(flush=True); time.sleep(60)"
+    code = "from signal import *; import time; signal(SIGINT, SIG_IGN); print(flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as child:
         child.stdout.readline()
         assert real_time.stop_child(child) == -signal.SIGKILL
