@@ -1,5 +1,5 @@
-"""The live room's process: takes events, draws what has changed at most fifteen times a second, while somebody
-looks.
+"""The live room's process: takes events, and draws what has changed, at most fifteen times a second, while
+some browser looks.
 
 It has the lowest priority and ends with the process that started it, which it can neither hold up nor end.
 That one starts it again if it ends by itself, and ends it if its heartbeat stops.
