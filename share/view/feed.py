@@ -52,7 +52,7 @@ class ViewFeed:
         self._recap = Recap()
         self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
         # the newest of each run or agent, not queued
-        self._poses: dict[str, PoseUpdate] = {}
+        self._poses: Mapping[str, PoseUpdate] = {}
         self._refusals: dict[str | None, ev.DecisionMade] = {}
         self._report: ev.AgentsReported | None = None
         self._sent_stamps: dict[str, int] = {}
