@@ -39,7 +39,8 @@ class EdgeStatus:
         try:
             return self._get("snapshot.json"), self._get("plan.json")
         except (OSError, HTTPException) as error:
-            reason = printable(str(error) or type(error).__name__)
+            said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            reason = printable(said[:1].lower() + said[1:])
             raise ShareError(f"{self._address} does not answer: {reason}") from None
         except ValueError:  # no JSON, or more than is read
             raise ShareError(f"{self._address}: what answers there is no edge's status page") from None

@@ -60,6 +60,8 @@ tr.gone { color: var(--dim) }
   td:first-child { grid-column: 1 / -1; font-weight: 600; justify-content: flex-start }
   td:first-child::before { display: none }
   td[data-label=reason] { grid-column: 1 / -1 }
+  #loops td:first-child { grid-column: auto; font-weight: inherit; justify-content: space-between }
+  #loops td:first-child::before { display: inline }
   td.empty { display: none }
 }
 </style>
@@ -117,7 +119,10 @@ function duration(s) {
 
 const COLOURS = %COLOURS%;
 let colours = {};
-const colour = name => colours[name] ??= COLOURS[Object.keys(colours).length % COLOURS.length];
+const nameOf = label => label.split("/")[0];  // without the run's tag
+function colour(label) {
+  return colours[nameOf(label)] ??= COLOURS[Object.keys(colours).length % COLOURS.length];
+}
 
 const SVG = at("svg").namespaceURI;
 function shape(tag, attributes, content) {
@@ -176,7 +181,7 @@ const age = ms => typeof ms !== "number" ? "–"
 const isQuarantined = a => ["set apart", "disputed"].includes(a.consistency?.state);
 const percent = log => Math.abs(100 * Math.expm1(log)).toFixed(1);
 function describeConsistency(c) {
-  if (c.reason) return c.reason;
+  if (c.reason || c.state === "unknown") return c.reason;
   if (typeof c.log_scale !== "number") return "";
   const sigma = `± ${fixed(100 * c.sigma, 1)} %`;
   if (!c.put_right && Math.abs(c.log_scale) < 2 * c.sigma) return `depths agree within ${sigma}`;
@@ -212,6 +217,7 @@ function named(name) {
 
 function show(now) {
   updateRates(now);
+  Object.keys(now.agents ?? {}).forEach(colour);  // in the order in which they came, as in the live room
   const trouble = [...now.trouble ?? [], ...now.agent_trouble ?? []];
   const count = matches => entries(now.agents).filter(([, a]) => matches(a)).length;
   const agentCount = n => `${n} agent${n === 1 ? "" : "s"}`;
@@ -278,6 +284,7 @@ async function refresh() {
   }
   setTimeout(refresh, 300);
 }
+// after a first report, which has the order of colours
 async function refreshPlan() {
   try {
     const answer = await fetch("plan.json", {signal: AbortSignal.timeout(4000)});
@@ -285,8 +292,7 @@ async function refreshPlan() {
   } catch {}  // the mark says that there is no answer
   setTimeout(refreshPlan, 1000);
 }
-refresh();
-refreshPlan();
+refresh().then(refreshPlan);
 </script>
 </html>
 """

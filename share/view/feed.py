@@ -1,8 +1,8 @@
 """Bounded queue from the edge to the live room. It never blocks the edge; when full it drops its oldest.
 
-The edge's loop only appends values that it has anyway; of poses, reports and refusals the newest is kept. A
-thread makes events of them and sends them to the
-viewer's process; if that is slow, this thread waits, and the queue drops.
+The edge's loop only appends values that it has anyway, and wakes nobody; of poses, reports and refusals the
+newest is kept. A thread looks fifteen times a second, makes events of them and sends them to the viewer's
+process; if that is slow, this thread waits, and the queue drops.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import pickle
 import threading
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
@@ -34,7 +33,7 @@ _REPORTED = (
 )
 END = b""
 _MOST_AT_ONCE = 32  # with keyframes of 30 kB, 1 MB
-_COLLECT_S = 0.03  # between messages; the viewer draws fifteen times a second
+_COLLECT_S = 1 / 15  # between messages: as often as the viewer draws
 
 
 class _QueuedKeyframe(NamedTuple):
@@ -53,7 +52,7 @@ class ViewFeed:
         self._recap = Recap()
         self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
         # the newest of each run or agent, not queued
-        self._poses: dict[str, PoseUpdate] = {}
+        self._poses: Mapping[str, PoseUpdate] = {}
         self._refusals: dict[str | None, ev.DecisionMade] = {}
         self._report: ev.AgentsReported | None = None
         self._sent_stamps: dict[str, int] = {}
@@ -61,8 +60,7 @@ class ViewFeed:
         self._runs: dict[str, ev.RunArrived] = {}
         self._left_out_before = 0  # when runs were sent
         self.left_out = 0  # entries that were dropped
-        self._wake = threading.Event()
-        self._is_closed = False
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._send_loop, name="view", daemon=True)
         self._thread.start()
 
@@ -101,8 +99,7 @@ class ViewFeed:
 
     def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None:
         """Replace the newest poses, by run."""
-        self._poses = dict(poses)
-        self._wake.set()
+        self._poses = poses
 
     def add_report(self, report: Mapping[str, Any]) -> None:
         """Add edge.json as it is now."""
@@ -111,7 +108,6 @@ class ViewFeed:
             for label, agent in report.get("agents", {}).items()
         }
         self._report = ev.AgentsReported(agents, tuple(report.get("trouble", ())), self.left_out)
-        self._wake.set()
 
     def add_event(self, event: ev.RoomEvent) -> None:
         """Add an event as it is."""
@@ -120,27 +116,22 @@ class ViewFeed:
     def reconnect(self, connection: Connection) -> None:
         """Continue with another viewer, which first receives a recap."""
         self._next_connection = connection
-        self._wake.set()
 
     def close(self, wait_s: float = 1.0) -> None:
         """End; what is queued is sent for at most `wait_s`. May be repeated."""
-        self._is_closed = True
-        self._wake.set()
+        self._closing.set()
         self._thread.join(wait_s)
 
     def _add(self, entry: object) -> None:
         self.left_out += len(self._queue) == MAX_QUEUED
         self._queue.append(entry)  # drops the oldest
-        self._wake.set()
 
     # ------------------------------------------------------------------ the sender's thread
 
     def _send_loop(self) -> None:
-        while not (self._is_closed and not self._queue):
-            self._wake.wait()
-            if not self._is_closed:
-                time.sleep(_COLLECT_S)
-            self._wake.clear()
+        is_closing = False
+        while not (is_closing and not self._queue):
+            is_closing = self._closing.wait(_COLLECT_S)
             if (connection := self._next_connection) is not None:
                 self._connection, self._next_connection = connection, None
                 self._sent_stamps.clear()

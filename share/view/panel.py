@@ -88,9 +88,9 @@ class SidePanel:
         if agent["qoe"] is not None:
             rows.insert(0, ("QoE", f"{agent['qoe']:.2f} (target {agent['qoe_target']:.2f})"))
         if agent["delay_ms"] is not None:
-            rows.append(("delay", f"{agent['delay_ms']:.0f} ms"))
+            rows.append(("delay", _duration(agent["delay_ms"], 0)))
         if agent["pose_ms"] is not None:
-            rows.append(("pose age", f"{agent['pose_ms']:.1f} ms, limit {limit_ms:.0f} ms"))
+            rows.append(("pose age", f"{_duration(agent['pose_ms'], 1)}, limit {limit_ms:.0f} ms"))
         if corrected is not None:
             how_far = f"{1e3 * corrected.moved_m:.0f} mm, {max(0.0, now_s - corrected.at_s):.0f} s ago"
             rows.append(("correction", how_far))
@@ -113,6 +113,10 @@ class SidePanel:
             f'<div style="margin:0 0 10px">{head}{faults}{sparkline(ages, limit_ms, swatch)}'
             f"<table>{cells}</table>{decision}</div>"
         )
+
+
+def _duration(ms: float, digits: int) -> str:
+    return f"{ms:.{digits}f} ms" if ms < 1000 else f"{ms / 1000:.1f} s"
 
 
 def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:

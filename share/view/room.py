@@ -245,9 +245,7 @@ class Room:
         """Return what has changed since the last call."""
         out: list[dr.Drawing] = [*self._announcements]
         self._announcements = []
-        for name in [name for name, until_s in self._temporary.items() if now_s >= until_s]:
-            del self._temporary[name]
-            self._dirty[name] = _nothing
+        self._end_temporary(now_s)
         for key in sorted(self._moved_runs):
             if (run := self.runs.get(key)) is not None and (body := self._draw_body(run)):
                 out.append(body)
@@ -265,6 +263,19 @@ class Room:
         if (floor := self._new_floor()) is not None:
             out.append(floor)
         return out
+
+    def forget_moments(self, now_s: float) -> None:
+        """Forget what is shown only for a while, where nobody looks: what is left to draw stays bounded."""
+        self._announcements = []
+        self._end_temporary(now_s)
+
+    def _end_temporary(self, now_s: float) -> None:
+        for name in [name for name, until_s in self._temporary.items() if now_s >= until_s]:
+            del self._temporary[name]
+            if name in self._drawn:
+                self._dirty[name] = _nothing
+            else:
+                self._dirty.pop(name, None)
 
     @property
     def waiting(self) -> int:

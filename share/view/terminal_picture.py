@@ -30,6 +30,11 @@ _GOOD: Colour = (48, 164, 108)
 Report = Mapping[str, Any]
 
 
+def _name_of(label: str) -> str:
+    """Return the name of an agent without the tag that an earlier run has."""
+    return label.partition("/")[0]
+
+
 class TerminalPicture:
     """Remembers agents' colours and pose ages between pictures."""
 
@@ -40,8 +45,8 @@ class TerminalPicture:
     def lines(self, report: Report, plan: Report, columns: int, rows: int) -> list[str]:
         """Return the picture, at most `rows` lines of at most `columns` characters."""
         agents = {name: one for name, one in report.get("agents", {}).items() if not one.get("gone")}
-        for name in (*agents, *plan.get("agents", {})):
-            self._numbers.setdefault(name, len(self._numbers))
+        for label in (*report.get("agents", {}), *plan.get("agents", {})):  # in the order in which they came
+            self._numbers.setdefault(_name_of(label), len(self._numbers))
         for name, one in agents.items():
             if one.get("pose_ms") is not None:
                 self._ages_ms.setdefault(name, deque(maxlen=_HISTORY)).append(one["pose_ms"])
@@ -52,7 +57,7 @@ class TerminalPicture:
         return [*self._plans(plan, columns, height), *text]
 
     def _colour(self, name: str) -> Colour:
-        return agent_colour(self._numbers.get(name, 0))
+        return agent_colour(self._numbers.get(_name_of(name), 0))
 
     # ------------------------------------------------------------------ a line for each agent
 

@@ -1,4 +1,5 @@
-"""The live room's process: takes events, draws what has changed at most fifteen times a second.
+"""The live room's process: takes events, and draws what has changed, at most fifteen times a second, while
+some browser looks.
 
 It has the lowest priority and ends with the process that started it, which it can neither hold up nor end.
 That one starts it again if it ends by itself, and ends it if its heartbeat stops.
@@ -259,6 +260,10 @@ class Viewer:
         self._room.apply(event, now_s)
 
     def _draw(self, now_s: float) -> None:
+        """Draw what has changed. While nobody looks it is only remembered: drawing costs the most."""
+        if not self._window.is_watched():
+            self._room.forget_moments(now_s)
+            return
         if drawings := self._room.take_drawings(now_s):
             self._window.draw(drawings)
         for click in self._window.take_clicks():

@@ -81,6 +81,10 @@ class Window:
     def stop(self) -> None:
         self._server.stop()
 
+    def is_watched(self) -> bool:
+        """Return whether any browser is connected."""
+        return bool(self._server._websock_server._live_connections)
+
     def has_served(self) -> bool:
         """Return whether the thread that serves the browsers has run since the last call."""
         has_served, self._has_served = self._has_served, False

@@ -90,3 +90,9 @@ def test_only_who_is_present_can_be_followed() -> None:
     panel = SidePanel()
     panel.apply(ev.AgentsReported({"ann": AGENT, "bob": AGENT | {"run": "bob-1", "gone": True}}))
     assert panel.agents == {"ann-1": "ann"}
+
+
+def test_long_times_are_in_seconds() -> None:
+    late = AGENT | {"pose_ms": 19_233.7, "delay_ms": 136_871.0}
+    text = words(panel_of(ev.AgentsReported({"ann": late})))
+    assert "19.2 s, limit 20 ms" in text and "136.9 s" in text and "19233" not in text

@@ -371,3 +371,20 @@ def test_what_was_dropped_before_does_no_harm(event: ev.RoomEvent) -> None:
     room = Room()
     told(room, *one_agent(), event, keyframe("ann", 1, 1.0))
     assert len(room.runs["ann-1"].keyframes) == 2
+
+
+def test_what_happens_while_nobody_looks_is_drawn_later_and_what_was_shown_for_a_moment_is_not() -> None:
+    room = two_maps()
+    room.take_drawings(0.0)
+    for k in range(200):
+        room.apply(keyframe("ann", k + 1, 0.01 * k), float(k))
+        room.apply(ev.LoopAccepted(KeyframeKey("ann-1", k + 1), KeyframeKey("bob-1", 0)), float(k))
+        room.apply(ev.DecisionMade(float(k), "maps merged", "ann", "three loops"), float(k))
+        room.forget_moments(float(k))
+    assert room.waiting < 60  # chunks, and what the last seconds flashed
+    drawings = list[dr.Drawing]()
+    room.forget_moments(1e3)
+    while room.waiting:
+        drawings += room.take_drawings(1e3)
+    assert {"/points/0/0", "/loops/0"} <= names(drawings)
+    assert not of(drawings, "/loops/new") and dr.Announcement.__name__ not in names(drawings)

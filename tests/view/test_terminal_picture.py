@@ -7,6 +7,7 @@ from typing import Any
 import click
 import pytest
 
+from share.colours import agent_colour
 from share.view.terminal_picture import TerminalPicture
 
 COLUMNS, ROWS = 100, 24
@@ -71,7 +72,7 @@ def test_maps_that_are_apart_stand_beside_each_other() -> None:
     assert caption.index("map of bob") >= COLUMNS // 2 - 1
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(72, 18), (100, 24), (200, 60), (72, 8)])
+@pytest.mark.parametrize(("columns", "rows"), [(40, 12), (72, 18), (100, 24), (200, 60), (72, 8)])
 def test_it_fits_the_terminal(columns: int, rows: int) -> None:
     names = [f"agent-with-a-long-name-{k}" for k in range(9)]
     report = {"agents": {name: agent(trouble=["pose 3 s late \x1b[2J"]) for name in names}}
@@ -95,3 +96,11 @@ def test_what_is_wrong_stands_below_the_figures() -> None:
     lines = drawn(report, {"agents": {}})
     assert [line[:5] for line in lines[:2]] == ["■ ann", "■ tom"]
     assert [line.strip() for line in lines[2:]] == ["ann: LOST: dark; no clock"]
+
+
+def test_an_agent_keeps_the_colour_of_its_coming_however_late_one_looks() -> None:
+    """As in the live room: those who have gone, and earlier runs, have their place in the order."""
+    agents = {"tom/3": agent(gone=True), "ann": agent(), "tom": agent()}
+    lines = TerminalPicture().lines({"agents": agents}, {"agents": {}}, COLUMNS, 24)
+    swatches = [click.style("■ ", fg=agent_colour(number)) for number in (1, 0)]
+    assert [line[: len(swatch)] for line, swatch in zip(lines, swatches, strict=True)] == swatches

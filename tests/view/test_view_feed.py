@@ -97,7 +97,7 @@ def test_a_pose_is_told_once() -> None:
     def tell(feed: ViewFeed) -> None:
         for stamp_ns in (1, 1, 2):
             feed.add_poses({KEY: pose(stamp_ns)})
-            time.sleep(0.05)
+            time.sleep(0.2)  # longer than what is collected in one message
 
     poses = told(tell)
     assert [type(one) for one in poses] == [ev.PoseArrived] * 2

@@ -19,9 +19,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from math import comb
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,7 @@ def play(session: Path, viewers: int | None, out: Path) -> Played:
 
 
 def table(runs: list[Played]) -> str:
-    """Return means, and paired differences from the setup without a live room."""
+    """Return medians, and paired differences from the setup without a live room."""
     rounds = [runs[k : k + len(SETUPS)] for k in range(0, len(runs), len(SETUPS))]
     by_setup = {setup: [next(r for r in one if r.viewers == setup) for one in rounds] for setup in SETUPS}
     head = ("viewers", "edge CPU s", "a keyframe, ms", "difference %", "live room CPU s")
@@ -180,14 +181,14 @@ def table(runs: list[Played]) -> str:
         each_bare = [1e3 * one.edge_s / max(1, one.keyframes) for one in bare]
         cells = [
             "no live room" if setup is None else str(setup),
-            f"{np.mean([one.edge_s for one in played]):.2f}",
-            f"{np.mean(each):.1f}",
+            f"{np.median([one.edge_s for one in played]):.2f}",
+            f"{np.median(each):.1f}",
             _difference([100 * (a / b - 1) for a, b in zip(each, each_bare, strict=True)], 1),
-            f"{np.mean([one.view_s for one in played]):.2f}",
+            f"{np.median([one.view_s for one in played]):.2f}",
         ]
         for field in ("pose_p50_ms", "pose_p95_ms"):
             values, others = ([getattr(one, field) for one in of] for of in (played, bare))
-            cells.append(f"{np.mean(values):.1f}")
+            cells.append(f"{np.median(values):.1f}")
             cells.append(_difference([a - b for a, b in zip(values, others, strict=True)], 2))
         cells.append(str(int(np.mean([one.messages for one in played]))))
         rows.append(line(cells))
@@ -195,8 +196,20 @@ def table(runs: list[Played]) -> str:
 
 
 def _difference(values: list[float], digits: int) -> str:
-    error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
-    return f"{np.mean(values):+.{digits}f} ± {error:.{digits}f}"
+    low, high = median_interval(values)
+    return f"{np.median(values):+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+
+
+def median_interval(values: Sequence[float], least: float = 0.9) -> tuple[float, float]:
+    """Return the narrowest pair of order statistics that hold the median with at least this probability,
+    whatever the distribution; the extremes where there are too few for it."""
+    ordered = sorted(values)
+    n, outside, k = len(ordered), 0.0, 0
+    while k < n // 2 and outside + 2 * comb(n, k) / 2**n <= 1 - least:
+        outside += 2 * comb(n, k) / 2**n
+        k += 1
+    k = max(k - 1, 0)
+    return ordered[k], ordered[n - 1 - k]
 
 
 # In virtual time: the edge's own CPU, which does not depend on what else the machine does
@@ -250,15 +263,10 @@ def play_virtually(session: Session, seconds: float, viewers: int) -> dict[str, 
         return {
             "all": cpu_s,
             "calls": observer.cpu_s,
-            "sender": _thread_cpu_s(os.getpid(), sender.native_id or 0),
+            "sender": time.clock_gettime(time.pthread_getcpuclockid(sender.ident or 0)),
             "process": _stats()[live.pid or 0][1],
             "messages": len(counts),
         }
-
-
-def _thread_cpu_s(pid: int, thread: int) -> float:
-    fields = Path(f"/proc/{pid}/task/{thread}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
 def virtual_table(session: Session, seconds: float, rounds: int) -> str:

@@ -46,7 +46,7 @@ class MapMembership:
 EDGE_START_TIMEOUT_S = 20.0  # until the edge listens
 AGENT_GRACE_S = 60.0  # how much longer than its recording an agent may run
 _POLL_S = 0.5
-_STOP_S = 10.0
+_STOP_S = 30.0  # until a child that was asked to end is killed; on a busy machine an edge took 10 s
 _MERGE_EVENTS = ("maps merged", "merge undone")
 _EDGE_NICENESS = 10  # on a shared core, about a tenth of an agent's time
 Processes = dict[str, subprocess.Popen[bytes]]
@@ -165,8 +165,8 @@ def play_in_real_time(
             agents[name] = stack.enter_context(child)
         _watch(agents, _RunMonitor(folders, out / "edge" / "events.jsonl"), seconds + AGENT_GRACE_S, show)
         for name, process in {**agents, "edge": edge}.items():
-            if stop_child(process) != 0:
-                raise ShareError(f"{name} failed: {_last_line(logs[name])}")
+            if code := stop_child(process):
+                raise ShareError(f"{name} failed: {_why_it_failed(code, logs[name])}")
     return folders
 
 
@@ -222,6 +222,12 @@ class _RunMonitor:
                 self._merges = (*self._merges, text)
         sharing = len(self._membership.sharing_agents)
         return Progress(dict(self._frames), sharing, self._corrections, self._merges)
+
+
+def _why_it_failed(code: int, log: Path) -> str:
+    if code == -signal.SIGKILL:
+        return f"it was killed: out of memory, or it did not end within {_STOP_S:.0f} s on this busy machine"
+    return _last_line(log)
 
 
 def _last_line(log: Path) -> str:
