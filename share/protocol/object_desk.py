@@ -66,8 +66,9 @@ class ObjectDesk:
             self._clients.refuse(client, "unauthorised", objection)
             self._answer(client, message, objection)
             return
-        if any(n > message.request and row[0] == message.object_id for n, row in client.requests.items()):
-            self._answer(client, message, "")  # a later one of the same object has come before it
+        later = (row for n, row in client.requests.items() if n > message.request)
+        if any(object_id == message.object_id and not reason for object_id, reason in later):
+            self._answer(client, message, "")  # a later one of the same object has come before it, and holds
             return
         try:
             ticket = self._apply(client, message, default_map)
@@ -118,10 +119,13 @@ class ObjectDesk:
     # ------------------------------------------------------------ what clients have seen
 
     def begin_client(self, client: Client) -> None:
-        """Send all objects to a client that was welcomed."""
+        """Send all objects to a client that was welcomed; now, or with the next list that is due, as it may
+        say hello as often as it likes."""
         if client.hello.wants_objects:
             client.seen_revision, client.list_pause_s = -1, _LIST_S
-            self._send_newer(client)
+            client.list_due_ns = min(client.list_due_ns, self._out.now_ns + seconds_to_ns(_LIST_S))
+            if self._out.now_ns >= client.list_due_ns:
+                self._send_newer(client)
 
     def on_seen(self, client: Client, seen: ObjectsSeen) -> None:
         if seen.session == self._session and seen.revision <= self.objects.revision:

@@ -24,12 +24,21 @@ _ANSWERED_S = 0.6  # a bridge that was silent for longer may be dead
 Downlink = Welcome | Refused | Pong | ClientDownlink | ClientUplink
 
 
+@dataclass(frozen=True)
+class KnownCommand:
+    """A command of a client. robot: to which it was passed; None: to none yet. final: its last state, if
+    nothing follows."""
+
+    robot: str | None = None
+    final: CommandState | None = None
+
+
 @dataclass(eq=False)
 class Client(Sender):
     """A client that is present. id: of the transport.
 
     requests: by number, the object and the answer, None while it waits for the disk. forgotten_below: older
-    requests are not remembered. commands: the final state of each, None before. seen_revision: of objects.
+    requests are not remembered. commands: by number. seen_revision: of objects.
     """
 
     id: bytes
@@ -37,7 +46,7 @@ class Client(Sender):
     last_received_ns: int
     requests: dict[int, tuple[int, str | None]] = field(default_factory=dict)
     forgotten_below: int = 0
-    commands: dict[int, CommandState | None] = field(default_factory=dict)
+    commands: dict[int, KnownCommand] = field(default_factory=dict)
     newest_command: int = -1
     seen_revision: int = -1
     list_due_ns: int = 0
@@ -54,9 +63,12 @@ class Client(Sender):
             del self.requests[oldest]
             self.forgotten_below = max(self.forgotten_below, oldest + 1)
 
-    def remember_command(self, command: int, final: CommandState | None = None) -> None:
-        """final: its state, if nothing follows."""
-        self.commands[command] = self.commands.get(command) or final
+    def remember_command(
+        self, command: int, robot: str | None = None, final: CommandState | None = None
+    ) -> None:
+        """robot, final: as of `KnownCommand`; the first of each counts."""
+        known = self.commands.get(command, KnownCommand())
+        self.commands[command] = KnownCommand(known.robot or robot, known.final or final)
         self.newest_command = max(self.newest_command, command)
         while len(self.commands) > _MAX_COMMANDS:
             del self.commands[min(self.commands)]
