@@ -26,6 +26,7 @@ from corpus import Corpus
 from fuzzer import CurvePeer, _small, own_name
 from image_attacks import IMAGE_ATTACKS
 from raw_wire import GREETING, LONG, MORE, Message, RawPeer, dial, frame, pack, ready, unpack
+from room_attacks import ROOM_ATTACKS
 
 Counts = dict[str, Any]
 
@@ -450,7 +451,7 @@ ATTACKS: dict[str, Callable[[Ctx], None]] = {
         http_garbage,
     )
 }  # fmt: skip
-ATTACKS |= IMAGE_ATTACKS
+ATTACKS |= IMAGE_ATTACKS | ROOM_ATTACKS
 ATTACKS |= {f"flood-{kind}": flood(kind) for kind in ("ping", "pose", "evaluation", "keyframe")}
 
 

@@ -41,6 +41,9 @@ CASES = {name: Case() for name in ATTACKS if name != "streamed-hellos"} | {
     "false-loops": Case(MAP),
     "flood-image": Case(KEYS),
     "four-agents": Case(KEYS),
+    "client-hellos": Case(KEYS),
+    "client-objects": Case(KEYS),
+    "client-places": Case(KEYS),
 }
 ALSO = [
     ("reset-while-full", Case(KEYS)),
