@@ -80,7 +80,8 @@ class WireCommands:
         known.is_told = True
         if known.is_held(now_ns):
             known.repeated_ns = now_ns
-        if known.is_begun or not isinstance(command, Goto) or not command.has_begun:
+        is_over = known.is_begun or known.state.is_final
+        if is_over or not isinstance(command, Goto) or not command.has_begun:
             return [], [known.state]
         known.is_begun = True
         place = command.x, command.y, command.yaw, command.map_id

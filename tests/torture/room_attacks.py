@@ -11,6 +11,7 @@ from typing import Any
 
 from raw_wire import Message, pack, unpack
 
+Say = Callable[[int, int], list[Message]]  # of the number of a client and of a round
 CLIENTS, NAMES = 60, 20  # an edge has 64 places; a key speaks for twenty names
 
 
@@ -22,7 +23,7 @@ def _hello(c: Any, name: str, identity: bytes, **wants: bool) -> Message:
 
 
 def _clients(c: Any, **wants: bool) -> list[tuple[Any, Message]]:
-    """As many as find a place, each with its hello. drives_robot: three of a name; the first is the bridge."""
+    """As many as find a place, each with its hello. drives_robot: the first of each name."""
     out = []
     for k in range(CLIENTS):
         identity = c.draw.randbytes(8)
