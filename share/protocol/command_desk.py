@@ -131,9 +131,7 @@ class CommandDesk:
         if not self._may_say(bridge):
             return
         self.places[bridge.name] = place = replace(place, robot=bridge.name)
-        for client in self._clients:
-            if client.hello.wants_robots:
-                self._clients.send(client, place)
+        self._clients.send_all([one for one in self._clients if one.hello.wants_robots], place)
 
     def _may_say(self, bridge: Client) -> bool:
         now_ns = self._out.now_ns

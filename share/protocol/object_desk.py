@@ -55,8 +55,8 @@ class ObjectDesk:
                 self._clients.send(client, Receipt(message.request, known[1]))
             return
         now_ns = self._out.now_ns
-        if not self._clients.requests.bucket(client.name, now_ns).take(now_ns):
-            client.count("over_rate", "more requests about objects than 40 a second", now_ns)
+        if not self._clients.take_request(client.name, now_ns):
+            client.count("over_rate", "too many requests about objects", now_ns)
             return
         if len(self._unsaved) >= _MAX_UNSAVED:
             client.count("over_rate", "requests about objects wait for the disk", now_ns)
@@ -106,8 +106,9 @@ class ObjectDesk:
         told = change.object if isinstance(change, SaveObject) else change
         if told.removed:
             self._out.record("object removed", None, f"{told.kind} {told.object_id}: {told.removed}")
-        for client in self._wanting():
-            self._clients.send(client, told)
+        wanting = self._wanting()
+        self._clients.send_all(wanting, told)
+        for client in wanting:
             client.list_pause_s = _LIST_S
             client.list_due_ns = self._out.now_ns + seconds_to_ns(_LIST_S)
         kept = change if isinstance(change, SaveObject) else RemoveStoredObject(told.object_id)

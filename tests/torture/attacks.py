@@ -1,7 +1,7 @@
 """Attacks that are no fuzz: each an idea of its own. A process:
 
     python attacks.py NAME ADDRESS --corpus FILE [--seconds S] [--count N] [--seed S] [--http URL]
-                      [--keys PUBLIC SECRET SERVER]
+                      [--keys="PUBLIC SECRET SERVER"]
 
 Prints JSON. Nothing of `share` is imported.
 """
@@ -464,7 +464,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=800)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--http")
-    parser.add_argument("--keys", nargs=3)
+    parser.add_argument("--keys", type=str.split)  # one argument: a key may begin with a dash
     c = Ctx(parser.parse_args())
     spent, began = time.process_time(), time.monotonic()
     try:

@@ -1,7 +1,7 @@
 """One attacker, a process: mutated messages of one kind, or (for the control run) valid ones, at a pace.
 
     python fuzzer.py ADDRESS --corpus FILE --kind KIND --count N --rate R --seed S [--valid --cpu SHARE]
-                     [--keys PUBLIC SECRET SERVER] [--peer HEX] [--ring FILE]
+                     [--keys="PUBLIC SECRET SERVER"] [--peer HEX] [--ring FILE]
 
 Prints JSON at the end: messages sent; with_run, those sent by a run that the edge had welcomed and had not
 refused since; connections, closed, unanswered dials; CPU share; how many messages of each kind came back. It
@@ -309,7 +309,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--valid", action="store_true")
     parser.add_argument("--cpu", type=float, default=0.0)
-    parser.add_argument("--keys", nargs=3)
+    parser.add_argument("--keys", type=str.split)
     parser.add_argument("--peer")
     parser.add_argument("--ring", type=Path)
     return parser.parse_args(argv)

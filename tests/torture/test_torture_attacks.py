@@ -56,7 +56,7 @@ ALSO = [
 def attacked(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path) -> siege.Stay:
     def attack(edge: EdgeProgram) -> Program:
         more = ["--http", edge.http] if edge.http else []
-        more += ["--keys", *edge.keys.of(case.keys_of)] if edge.keys else []
+        more += ["--keys=" + " ".join(edge.keys.of(case.keys_of))] if edge.keys else []
         how = (
             "--corpus",
             traffic,
