@@ -92,6 +92,10 @@ class TokenBuckets:
     def __len__(self) -> int:
         return len(self._buckets)
 
+    def count_used(self, now_ns: int) -> int:
+        """Return how many keys have taken tokens that are not refilled yet."""
+        return sum(not one.is_full(now_ns) for one in self._buckets.values())
+
     def bucket(self, key: str, now_ns: int) -> TokenBucket:
         if key not in self._buckets:
             self._buckets = {one: kept for one, kept in self._buckets.items() if not kept.is_full(now_ns)}

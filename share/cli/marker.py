@@ -117,8 +117,7 @@ def list_objects(
     Example:  share marker list --edge tcp://127.0.0.1:5555 --name ann
     """
     with closing(room_options.open_room(address, name, keys, server_key, wants_objects=True)) as room:
-        for _ in room_options.news(room, lambda: not room.client.has_all_objects):
-            pass
+        room_options.wait_for_objects(room)
         objects = sorted(room.client.objects.items())
     rows: list[dict[str, Any]] = [
         {

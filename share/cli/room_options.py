@@ -67,6 +67,15 @@ def news(room: RoomLink, is_waiting: Callable[[], bool]) -> Iterator[ClientEffec
             raise no_answer(room)
 
 
+def wait_for_objects(room: RoomLink) -> None:
+    """Wait until all objects have come. Raises ShareError if they do not."""
+    end_s = time.monotonic() + ANSWER_S
+    for _ in news(room, lambda: not room.client.has_all_objects and time.monotonic() < end_s):
+        pass
+    if not room.client.has_all_objects:
+        raise ShareError(f"the edge did not send all objects of the room for {ANSWER_S:g} s")
+
+
 def answer(room: RoomLink, request: int) -> None:
     """Wait for the answer to a request about an object. Raises ShareError if it is refused, or none comes."""
     from share.protocol.room_events import RequestAnswered

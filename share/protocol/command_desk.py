@@ -39,24 +39,25 @@ class CommandDesk:
         if not self._clients.commands.bucket(client.name, now_ns).take(now_ns):
             client.count("over_rate", "more commands than 10 a second", now_ns)
             return
-        if (final := client.commands.get(command.command)) is not None:
-            self._clients.send(client, final)
+        known = client.commands.get(command.command)
+        if known is not None and known.final is not None:
+            self._clients.send(client, known.final)
             return
-        is_new = command.command not in client.commands
-        if is_new and command.command < client.newest_command:
+        if known is None and command.command < client.newest_command:
             self._end(client, command, "overtaken by a later command")
             return
-        robot = command.robot or self._only_robot()
+        # that of its first passing: it goes on where another robot has come since
+        robot = command.robot or (known and known.robot) or self._only_robot()
         bridge = None if robot is None else self._clients.bridge(robot)
         objection = self._objection(event, client, command, bridge)
-        client.remember_command(command.command)
+        client.remember_command(command.command, None if bridge is None else bridge.name)
         if objection is not None:
             self._end(client, command, self._clients.refuse(client, "refused", objection))
         elif bridge is None:  # the repetition finds it when it is back; the robot stops by itself meanwhile
             text = f"robot '{robot or '?'}' is not connected"
             self._clients.send(client, CommandState(command.command, command.robot, client.name, text))
         else:
-            if is_new:
+            if known is None:
                 self._record(client, command, bridge.name)
             passed = replace(command, robot=bridge.name, commander=client.name)
             self._clients.send(bridge, self._in_present_map(passed))
@@ -104,22 +105,23 @@ class CommandDesk:
     def _end(self, client: Client, command: Goto | Cancel, reason: str) -> None:
         text = printable(f"refused: {reason}")[:MAX_ANSWER_LENGTH]
         final = CommandState(command.command, command.robot, client.name, text, is_final=True)
-        client.remember_command(command.command, final)
+        client.remember_command(command.command, final=final)
         self._clients.send(client, final)
 
     # ------------------------------------------------------------ from bridges
 
     def on_state(self, bridge: Client, state: CommandState) -> None:
-        """Pass on what becomes of a command."""
+        """Pass on what becomes of a command: to its commander only from the robot that it was passed to."""
         if not self._may_say(bridge):
             return
         state = replace(state, robot=bridge.name)
         for client in self._clients:
-            if client.name == state.commander and state.command in client.commands:
-                if state.is_final and client.commands[state.command] is None:
+            known = client.commands.get(state.command) if client.name == state.commander else None
+            if known is not None and known.robot == bridge.name:
+                if state.is_final and known.final is None:
                     said = f"robot '{bridge.name}', sent by '{client.name}': {state.text}"
                     self._out.record("robot answered", None, said)
-                client.remember_command(state.command, state if state.is_final else None)
+                client.remember_command(state.command, final=state if state.is_final else None)
                 self._clients.send(client, state)
             elif client.hello.wants_robots:
                 self._clients.send(client, state)
@@ -129,9 +131,7 @@ class CommandDesk:
         if not self._may_say(bridge):
             return
         self.places[bridge.name] = place = replace(place, robot=bridge.name)
-        for client in self._clients:
-            if client.hello.wants_robots:
-                self._clients.send(client, place)
+        self._clients.send_all([one for one in self._clients if one.hello.wants_robots], place)
 
     def _may_say(self, bridge: Client) -> bool:
         now_ns = self._out.now_ns

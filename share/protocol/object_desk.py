@@ -55,8 +55,8 @@ class ObjectDesk:
                 self._clients.send(client, Receipt(message.request, known[1]))
             return
         now_ns = self._out.now_ns
-        if not self._clients.requests.bucket(client.name, now_ns).take(now_ns):
-            client.count("over_rate", "more requests about objects than 40 a second", now_ns)
+        if not self._clients.take_request(client.name, now_ns):
+            client.count("over_rate", "too many requests about objects", now_ns)
             return
         if len(self._unsaved) >= _MAX_UNSAVED:
             client.count("over_rate", "requests about objects wait for the disk", now_ns)
@@ -66,8 +66,9 @@ class ObjectDesk:
             self._clients.refuse(client, "unauthorised", objection)
             self._answer(client, message, objection)
             return
-        if any(n > message.request and row[0] == message.object_id for n, row in client.requests.items()):
-            self._answer(client, message, "")  # a later one of the same object has come before it
+        later = (row for n, row in client.requests.items() if n > message.request)
+        if any(object_id == message.object_id and not reason for object_id, reason in later):
+            self._answer(client, message, "")  # a later one of the same object has come before it, and holds
             return
         try:
             ticket = self._apply(client, message, default_map)
@@ -105,8 +106,9 @@ class ObjectDesk:
         sent = change.object if isinstance(change, SaveObject) else change
         if sent.removed:
             self._out.record("object removed", None, f"{sent.kind} {sent.object_id}: {sent.removed}")
-        for client in self._wanting():
-            self._clients.send(client, sent)
+        wanting = self._wanting()
+        self._clients.send_all(wanting, sent)
+        for client in wanting:
             client.list_pause_s = _LIST_S
             client.list_due_ns = self._out.now_ns + seconds_to_ns(_LIST_S)
         kept = change if isinstance(change, SaveObject) else RemoveStoredObject(sent.object_id)
@@ -118,10 +120,13 @@ class ObjectDesk:
     # ------------------------------------------------------------ what clients have seen
 
     def begin_client(self, client: Client) -> None:
-        """Send all objects to a client that was welcomed."""
+        """Send all objects to a client that was welcomed; now, or with the next list that is due, as it may
+        say hello as often as it likes."""
         if client.hello.wants_objects:
             client.seen_revision, client.list_pause_s = -1, _LIST_S
-            self._send_newer(client)
+            client.list_due_ns = min(client.list_due_ns, self._out.now_ns + seconds_to_ns(_LIST_S))
+            if self._out.now_ns >= client.list_due_ns:
+                self._send_newer(client)
 
     def on_seen(self, client: Client, seen: ObjectsSeen) -> None:
         if seen.session == self._session and seen.revision <= self.objects.revision:

@@ -24,7 +24,8 @@ class ObjectMirror:
         return {n: one for n, one in (self._earlier | self._held).items() if not one.removed}
 
     def begin_session(self, session: int) -> None:
-        self._session, self._earlier, self._held = session, self.objects, {}
+        earlier = list(self.objects.items())[: 2 * MAX_LISTED]  # an edge may begin ever new sessions
+        self._session, self._earlier, self._held = session, dict(earlier), {}
         self._list, self.is_complete = None, False
 
     def add(self, change: RoomObject) -> RoomObject | None:

@@ -34,6 +34,7 @@ class _OpenRequest:
     message: room.PutObject | room.RemoveObject
     sent_ns: int | None = None
     session: int | None = None  # in which it was sent first
+    replaced: tuple[int, ...] = ()  # requests about the same object that it came instead of
 
 
 @dataclass
@@ -180,16 +181,17 @@ class RoomClient:
     # ------------------------------------------------------------ objects
 
     def _on_request(self, message: room.PutObject | room.RemoveObject) -> None:
+        replaced: tuple[int, ...] = ()
         for number, one in list(self._requests.items()):
             if one.message.object_id == message.object_id:  # its effect would be overwritten at once
                 del self._requests[number]
-                self._effects.append(ev.RequestAnswered(number, ""))
+                replaced = (*one.replaced, number)[-MAX_OPEN:]
         if len(self._requests) >= MAX_OPEN:
             self._effects.append(
                 ev.RequestAnswered(message.request, f"{MAX_OPEN} requests wait for an answer already")
             )
             return
-        self._requests[message.request] = _OpenRequest(message)
+        self._requests[message.request] = _OpenRequest(message, replaced=replaced)
 
     def _on_receipt(self, receipt: room.Receipt) -> None:
         if (one := self._requests.pop(receipt.request, None)) is None:
@@ -197,7 +199,8 @@ class RoomClient:
         reason, is_removal = receipt.reason, isinstance(one.message, room.RemoveObject)
         if is_removal and one.session != self._connection.sessions.session:
             reason = ""  # the edge that it was sent to first may have done it
-        self._effects.append(ev.RequestAnswered(receipt.request, reason))
+        numbers = (*one.replaced, receipt.request)
+        self._effects += [ev.RequestAnswered(number, reason) for number in numbers]
 
     def _on_objects(self, message: room.RoomObject | room.ObjectList) -> None:
         if isinstance(message, room.RoomObject):
@@ -212,11 +215,12 @@ class RoomClient:
 
     def _on_command(self, message: room.Goto | room.Cancel) -> None:
         if isinstance(message, room.Cancel):  # its own goals are repeated no longer
-            for one in self._commands.values():
-                is_goal = isinstance(one.message, room.Goto)
-                if is_goal and (
-                    one.message.robot == message.robot or None in (one.message.robot, message.robot)
-                ):
+            goals = [one for one in self._commands.values() if isinstance(one.message, room.Goto)]
+            robots = {one.message.robot for one in goals if one.is_repeated}
+            if message.robot is None and len(robots) == 1:
+                message = replace(message, robot=robots.pop())
+            for one in goals:
+                if one.message.robot == message.robot or None in (one.message.robot, message.robot):
                     one.is_repeated = False
         self._commands[message.command] = _OpenCommand(message, self._now_ns)
 
@@ -231,8 +235,10 @@ class RoomClient:
         one.heard_ns = self._now_ns
         if state.is_final:
             self._end_command(state.command)
-        elif isinstance(one.message, room.Goto):
-            one.message = replace(one.message, has_begun=True)
+        elif isinstance(one.message, room.Goto) and not one.message.has_begun:
+            robot = one.message.robot or state.robot  # that one, where further robots come
+            one.message = replace(one.message, has_begun=True, robot=robot)
+            one.sent_ns = None  # the robot waits for it
 
     def _give_up(self, command: int, one: _OpenCommand) -> None:
         """End a command that nobody answers; a robot that has it stops, since it is not repeated."""

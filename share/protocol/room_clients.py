@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from share.protocol.admission import NAME_HOLD_S, name_objection
@@ -17,6 +17,7 @@ from share.wire.room_messages import ClientDownlink, ClientHello, ClientUplink, 
 MAX_CLIENTS, MAX_OF_NAME = 64, 8
 _NEW_RUN_LIMIT = (8.0, 2.0)  # at once, and a second, of a name
 _REQUEST_LIMIT, _COMMAND_LIMIT, _STATE_LIMIT = (80.0, 40.0), (20.0, 10.0), (40.0, 20.0)  # of a name
+_FULL_RATE_NAMES = 3  # of more names that ask at a time about objects, each has a smaller part of their rate
 _MAX_REQUESTS, _MAX_COMMANDS = 64, 16  # of a client that are remembered
 _MAX_REMOVED = 256  # clients that are remembered
 _ANSWERED_S = 0.6  # a bridge that was silent for longer may be dead
@@ -24,12 +25,21 @@ _ANSWERED_S = 0.6  # a bridge that was silent for longer may be dead
 Downlink = Welcome | Refused | Pong | ClientDownlink | ClientUplink
 
 
+@dataclass(frozen=True)
+class KnownCommand:
+    """A command of a client. robot: to which it was passed; None: to none yet. final: its last state, if
+    nothing follows."""
+
+    robot: str | None = None
+    final: CommandState | None = None
+
+
 @dataclass(eq=False)
 class Client(Sender):
     """A client that is present. id: of the transport.
 
     requests: by number, the object and the answer, None while it waits for the disk. forgotten_below: older
-    requests are not remembered. commands: the final state of each, None before. seen_revision: of objects.
+    requests are not remembered. commands: by number. seen_revision: of objects.
     """
 
     id: bytes
@@ -37,7 +47,7 @@ class Client(Sender):
     last_received_ns: int
     requests: dict[int, tuple[int, str | None]] = field(default_factory=dict)
     forgotten_below: int = 0
-    commands: dict[int, CommandState | None] = field(default_factory=dict)
+    commands: dict[int, KnownCommand] = field(default_factory=dict)
     newest_command: int = -1
     seen_revision: int = -1
     list_due_ns: int = 0
@@ -54,9 +64,12 @@ class Client(Sender):
             del self.requests[oldest]
             self.forgotten_below = max(self.forgotten_below, oldest + 1)
 
-    def remember_command(self, command: int, final: CommandState | None = None) -> None:
-        """final: its state, if nothing follows."""
-        self.commands[command] = self.commands.get(command) or final
+    def remember_command(
+        self, command: int, robot: str | None = None, final: CommandState | None = None
+    ) -> None:
+        """robot, final: as of `KnownCommand`; the first of each counts."""
+        known = self.commands.get(command, KnownCommand())
+        self.commands[command] = KnownCommand(known.robot or robot, known.final or final)
         self.newest_command = max(self.newest_command, command)
         while len(self.commands) > _MAX_COMMANDS:
             del self.commands[min(self.commands)]
@@ -88,9 +101,21 @@ class ClientRegistry:
         return sorted(one.name for one in self if one.hello.drives_robot)
 
     def send(self, client: Client, message: Downlink) -> None:
+        self.send_all([client], message)
+
+    def send_all(self, clients: Sequence[Client], message: Downlink) -> None:
         frames = encode(message)
-        client.counts["bytes_down"] += message_bytes(frames)
-        self._out.add(SendToPeer(client.id, frames))
+        size = message_bytes(frames)
+        for client in clients:
+            client.counts["bytes_down"] += size
+            self._out.add(SendToPeer(client.id, frames))
+
+    def take_request(self, name: str, now_ns: int) -> bool:
+        """Return whether a client may make a request about an object now: each is stored, and sent to all, so
+        many names together may make no more than a few."""
+        bucket = self.requests.bucket(name, now_ns)
+        share = self.requests.count_used(now_ns) / _FULL_RATE_NAMES
+        return bucket.take(now_ns, cost=min(max(1.0, share), _REQUEST_LIMIT[0]))
 
     def refuse(self, client: Client, kind: str, reason: str) -> str:
         """Count and record what a client may not do; return the reason."""

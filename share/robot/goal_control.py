@@ -134,6 +134,10 @@ class GoalControl:
             is_late = now_ns - goal.failed_ns > seconds_to_ns(_RESULT_S)
             return self._end("the robot gave up, without a reason") if is_late else []
         if goal.stopped_ns is not None:
+            waited_ns = now_ns - max(goal.sent_ns, goal.stopped_ns)
+            if goal.status is ev.GoalStatus.UNKNOWN and waited_ns > seconds_to_ns(ACCEPT_S):
+                text = f"stopped: {goal.stop_reason}; the robot's navigation never took the goal"
+                return [ev.CancelGoal(goal.goal_id), *self._end(text)]  # a late start is an orphan
             return self._repeat_cancel(goal, goal.stopped_ns, now_ns)
         if goal.status is ev.GoalStatus.UNKNOWN:
             if goal.refused_ns is not None and now_ns - goal.refused_ns > seconds_to_ns(_REFUSED_S):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from share.checks import checked_pose
+from share.checks import checked_map_id, checked_pose
 from share.errors import WireError, printable
 from share.files.json_file import parse_json
 from share.geometry.se3 import from_quat
@@ -46,7 +46,7 @@ def _event(message: dict[str, Any]) -> AgentPoseReceived:
         sequence,
         TrackState(message["state"]),
         None if in_map is None else _pose(in_map),
-        None if map_id is None else printable(map_id)[:100],
+        None if map_id is None else checked_map_id(map_id),
         None if in_map is None else _sigma_m(in_map["covariance"]),
         None if age_ms is None else round(1e6 * age_ms),
         has_edge if isinstance(has_edge, bool) else None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from share.errors import printable
@@ -30,42 +30,62 @@ class _KnownCommand:
     state: CommandState
     repeated_ns: int
     is_told: bool = True  # its state was sent
+    is_begun: bool = True
+
+    def is_held(self, now_ns: int) -> bool:
+        """Whether its commander has repeated it in time."""
+        return now_ns - self.repeated_ns <= seconds_to_ns(LEASE_S)
 
 
 class WireCommands:
-    """Turns commands into events of the bridge, and its reports into states. Commands go by commander and
-    number: each is used once."""
+    """Turns commands into events of the bridge, and its reports into states. Commands go by kind, commander
+    and number: each is used once.
+
+    A goal begins once its commander has heard of the bridge (`has_begun`): one that waited in a queue while
+    its commander went away begins nothing.
+    """
 
     def __init__(self) -> None:
-        self._known: dict[tuple[str, int], _KnownCommand] = {}
+        self._known: dict[tuple[type, str, int], _KnownCommand] = {}
         self._progress_timer, self._place_timer = PeriodicTimer(_PROGRESS_S), PeriodicTimer(_PLACE_S)
 
     def take(
         self, command: Goto | Cancel, make_goal_id: Callable[[], bytes], now_ns: int
     ) -> tuple[list[ev.RobotEvent], list[CommandState]]:
         """Return the events of a command, and the states to send. make_goal_id: makes the id of a goal."""
-        key = command.commander, command.command
+        key = type(command), command.commander, command.command
         if (known := self._known.get(key)) is not None:
-            known.repeated_ns, known.is_told = now_ns, True
-            return [], [known.state]
+            return self._repeat(known, command, now_ns)
         events: list[ev.RobotEvent] = []
         goal_id, text, is_reached = b"", "", False
-        commander = commander_text(command.commander)
         if isinstance(command, Cancel):
-            events, text, is_reached = [ev.CancelRequested(commander)], "cancelled", True
+            events = [ev.CancelRequested(commander_text(command.commander))]
+            text, is_reached = "cancelled", True
         elif command.has_begun:
             text = "stopped: the robot's bridge was restarted; give the goal again"
         elif not self._make_room():
             text = "refused: too many goals under way"
         else:
             goal_id = make_goal_id()
-            place = command.x, command.y, command.yaw, command.map_id
-            events = [ev.GotoRequested(commander, goal_id, *place)]
         is_final = not goal_id
         state = CommandState(command.command, None, command.commander, text or "taken", is_final, is_reached)
         self._make_room()
-        self._known[key] = _KnownCommand(goal_id, state, now_ns)
-        return events, [state] if is_final else []
+        self._known[key] = _KnownCommand(goal_id, state, now_ns, is_begun=is_final)
+        return events, [state]
+
+    def _repeat(
+        self, known: _KnownCommand, command: Goto | Cancel, now_ns: int
+    ) -> tuple[list[ev.RobotEvent], list[CommandState]]:
+        """Hold a command that is known, unless that comes too late; begin it where it has not begun."""
+        known.is_told = True
+        if known.is_held(now_ns):
+            known.repeated_ns = now_ns
+        is_over = known.is_begun or known.state.is_final
+        if is_over or not isinstance(command, Goto) or not command.has_begun:
+            return [], [known.state]
+        known.is_begun = True
+        place = command.x, command.y, command.yaw, command.map_id
+        return [ev.GotoRequested(commander_text(command.commander), known.goal_id, *place)], []
 
     def report(self, report: ev.GoalReport, now_ns: int) -> CommandState | None:
         """Take a report of the bridge; return the state to send now, if it is about a command of the wire."""
@@ -85,10 +105,14 @@ class WireCommands:
     def tick(self, now_ns: int) -> tuple[list[ev.RobotEvent], list[CommandState]]:
         """Give up goals that are not repeated; return states on the way that were held back."""
         events: list[ev.RobotEvent] = []
-        for known in self._known.values():
-            if not known.state.is_final and now_ns - known.repeated_ns > seconds_to_ns(LEASE_S):
+        lost = [one for one in self._known.values() if not (one.state.is_final or one.is_held(now_ns))]
+        for known in lost:
+            if known.is_begun:
                 known.repeated_ns = now_ns  # said again where the robot goes on
                 events.append(ev.CommanderLost(commander_text(known.state.commander)))
+            else:
+                text = f"stopped: the link to {commander_text(known.state.commander)} is gone"
+                known.state, known.is_told = replace(known.state, text=text, is_final=True), False
         held = [known for known in self._known.values() if not known.is_told]
         if not held or not self._progress_timer.fire_if_due(now_ns):
             return events, []
@@ -101,13 +125,15 @@ class WireCommands:
         return robot_place(report()) if self._place_timer.fire_if_due(now_ns) else None
 
     def _make_room(self) -> bool:
-        """Forget the oldest final command of too many. Return whether there is room."""
+        """Forget one of too many commands: the oldest final one, else one that never began. Return whether
+        there is room."""
         if len(self._known) < _MAX_KNOWN:
             return True
-        final = next((key for key, one in self._known.items() if one.state.is_final), None)
-        if final is None:
+        known = self._known.items()
+        ended = [key for key, one in known if one.state.is_final]
+        if not (ended := ended or [key for key, one in known if not one.is_begun]):
             return False
-        del self._known[final]
+        del self._known[ended[0]]
         return True
 
 

@@ -57,10 +57,15 @@ class RobotBridgeRun:
         self._is_stopped = True
 
     def run(self) -> None:
-        """Serve until stopped; then cancel the goal under way, and wait a moment until the robot confirms
-        it."""
-        while not self._is_stopped:
-            self.step(_TICK_S)
+        """Serve until stopped; then, or after an error, cancel the goal under way, and wait a moment until
+        the robot confirms it."""
+        try:
+            while not self._is_stopped:
+                self.step(_TICK_S)
+        finally:
+            self._end_goal()
+
+    def _end_goal(self) -> None:
         self._handle(ev.CancelRequested("the end of the bridge"))
         end_ns = time.monotonic_ns() + _END_NS
         while self.bridge.has_goal and time.monotonic_ns() < end_ns:

@@ -392,3 +392,13 @@ def test_navigation_that_was_restarted_has_no_goal(drive: RobotDrive) -> None:
     under_way(drive)
     drive.handle(ev.StatusReceived(()))
     assert drive.last_report.is_final and "restarted" in drive.last_report.text
+
+
+def test_a_goal_that_was_stopped_and_never_taken_ends(drive: RobotDrive) -> None:
+    drive.goto()
+    drive.handle(ev.CancelRequested("bob"))
+    drive.run(6.0)
+    assert drive.last_report.text == "stopped: cancelled by bob; the robot's navigation never took the goal"
+    assert drive.last_report.is_final
+    goal_id = drive.goto(commander="bob")
+    assert drive.of(ev.SendGoal)[-1].goal_id == goal_id

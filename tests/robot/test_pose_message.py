@@ -72,3 +72,9 @@ values = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_s
 def test_a_key_of_anybody(key, value):
     with contextlib.suppress(WireError):
         parse_pose_message(message(**{key: value}))
+
+
+@pytest.mark.parametrize("map_id", ["", "m" * 97, "a\u202eb"])
+def test_a_map_that_no_wire_would_pass_on_is_no_message(map_id):
+    with pytest.raises(WireError, match="map_id"):
+        parse_pose_message(message(map_id=map_id))

@@ -357,3 +357,81 @@ def test_without_any_answer_a_command_ends() -> None:
     bench.run(11)
     (state,) = [one.state for one in bench.of(ann, ce.CommandChanged)]
     assert state.is_final and state.text == "no edge answers"
+
+
+def test_the_bridge_of_another_robot_cannot_answer_for_one(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.bench.client("eve", 66, drives_robot=True)
+    robot.run(0.1)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.bench.said(eve, room.CommandState(1, "bot", "ann", "reached", True, True))
+    robot.run(4)
+    assert robot.has_goal and not robot.last(ann, 1).is_final
+    assert robot.bench.reasons("robot answered") == []
+
+
+def test_a_goal_for_the_only_robot_goes_on_where_a_second_one_comes(robot) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1, robot=None)
+    robot.run(1)
+    robot.bench.client("other", 77, drives_robot=True)
+    robot.run(4)
+    assert robot.has_goal and robot.last(ann, 1).text == "executing"
+    robot.bench.restart_edge()
+    robot.bench.correct(robot.bench.agent("ann", 1), MAP, np.eye(4))
+    robot.run(4)
+    assert robot.has_goal
+    robot.bench.to_client(ann, ce.CommandWanted(room.Cancel(2, None)))  # that of its goal
+    robot.run(0.5)
+    assert not robot.has_goal and robot.last(ann, 2).is_reached
+
+
+def test_a_cancel_by_the_number_of_a_goal_stops_and_does_not_hold_it() -> None:
+    robot = WiredRobot(RoomBench(rights={"ann": frozenset(Permission)}))
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1)
+    robot.run(1)
+    del robot.bench.clients[ann]
+    robot.bench.rights["ann"] = frozenset()
+    other = robot.commander("ann", 99)
+    for _ in range(10):
+        robot.bench.said(other, room.Cancel(1, "bot"))
+        robot.run(0.5)
+    assert not robot.has_goal
+
+
+def test_a_goal_that_waited_while_its_commander_went_away_begins_nothing(robot) -> None:
+    """As where the bridge's process, or the edge's, was stopped: what waited in its queue comes late."""
+    goal = room.Goto(1, "bot", "ann", None, 2.0, -1.0)
+    for _ in range(5):
+        robot._carry_out(*robot.commands.take(goal, robot._goal_id, robot.bench.now_ns))
+    robot.run(4)
+    assert not robot.sent
+    late = robot.commands.take(replace(goal, has_begun=True), robot._goal_id, robot.bench.now_ns)
+    assert late[1][0].is_final and not late[0]
+
+
+def test_a_lease_that_ran_out_is_not_renewed_by_what_waited(robot) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_bridge_alive = False  # stopped, for a minute
+    robot.run(2)
+    repetition, robot.taken = robot.taken, len(robot.bench.effects[BOT])
+    assert robot.taken > repetition and robot.has_goal
+    waiting = [one for one in robot.bench.effects[BOT][repetition:] if isinstance(one, ce.RobotCommanded)]
+    del robot.bench.clients[ann]
+    robot.run(60)
+    robot.is_bridge_alive = True
+    for one in waiting:
+        robot._carry_out(*robot.commands.take(one.command, robot._goal_id, robot.bench.now_ns))
+    robot.run(0.2)
+    assert waiting and not robot.has_goal
+
+
+def test_goals_that_are_not_confirmed_leave_room_for_others(robot) -> None:
+    for n in range(200):
+        robot.commands.take(room.Goto(n, "bot", "eve", None, 2.0, -1.0), robot._goal_id, robot.bench.now_ns)
+    robot.goto(robot.commander("ann", 31), 1)
+    robot.run(1)
+    assert robot.has_goal

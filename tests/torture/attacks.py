@@ -1,7 +1,7 @@
 """Attacks that are no fuzz: each an idea of its own. A process:
 
     python attacks.py NAME ADDRESS --corpus FILE [--seconds S] [--count N] [--seed S] [--http URL]
-                      [--keys PUBLIC SECRET SERVER]
+                      [--keys="PUBLIC SECRET SERVER"]
 
 Prints JSON. Nothing of `share` is imported.
 """
@@ -26,6 +26,7 @@ from corpus import Corpus
 from fuzzer import CurvePeer, _small, own_name
 from image_attacks import IMAGE_ATTACKS
 from raw_wire import GREETING, LONG, MORE, Message, RawPeer, dial, frame, pack, ready, unpack
+from room_attacks import ROOM_ATTACKS
 
 Counts = dict[str, Any]
 
@@ -450,7 +451,7 @@ ATTACKS: dict[str, Callable[[Ctx], None]] = {
         http_garbage,
     )
 }  # fmt: skip
-ATTACKS |= IMAGE_ATTACKS
+ATTACKS |= IMAGE_ATTACKS | ROOM_ATTACKS
 ATTACKS |= {f"flood-{kind}": flood(kind) for kind in ("ping", "pose", "evaluation", "keyframe")}
 
 
@@ -463,7 +464,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=800)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--http")
-    parser.add_argument("--keys", nargs=3)
+    parser.add_argument("--keys", type=str.split)  # one argument: a key may begin with a dash
     c = Ctx(parser.parse_args())
     spent, began = time.process_time(), time.monotonic()
     try:

@@ -1,7 +1,7 @@
 """One attacker, a process: mutated messages of one kind, or (for the control run) valid ones, at a pace.
 
     python fuzzer.py ADDRESS --corpus FILE --kind KIND --count N --rate R --seed S [--valid --cpu SHARE]
-                     [--keys PUBLIC SECRET SERVER] [--peer HEX] [--ring FILE]
+                     [--keys="PUBLIC SECRET SERVER"] [--peer HEX] [--ring FILE]
 
 Prints JSON at the end: messages sent; with_run, those sent by a run that the edge had welcomed and had not
 refused since; connections, closed, unanswered dials; CPU share; how many messages of each kind came back. It
@@ -22,7 +22,7 @@ import random
 import sys
 import time
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -57,6 +57,49 @@ class Run:
     speaker: Speaker | None = None
     welcome: bool = False
     hello_at: float = -math.inf
+
+
+@dataclass
+class Heard:
+    """What the edge has said of the room: with it a client's messages get as far as they can."""
+
+    bridge: str  # the name of the attacker's own robot
+    number: int = 0  # of requests and commands
+    map_id: str | None = None
+    objects: tuple[int, int] = (1, 0)  # session, revision
+    commands: deque[tuple[int, str]] = field(default_factory=lambda: deque([(0, "")], maxlen=64))
+
+    def take(self, kind: str, parts: Message) -> None:
+        """Raises LookupError, TypeError or ValueError for what is no message."""
+        scalars: Any = unpack(parts[0])[2]  # type: ignore[index]
+        match kind:
+            case "object":
+                self.map_id = scalars[5]
+            case "objects":
+                self.objects = scalars[0], scalars[1]
+            case "goto" | "cancel":
+                self.commands.append((scalars[0], scalars[2]))
+
+    def fill(self, draw: random.Random, kind: str, message: Message) -> Message:
+        """A copy of a client's message that is about what there is."""
+        fields: Any = unpack(message[0])
+        scalars = fields[2]
+        self.number += 1
+        match kind:
+            case "put":
+                scalars[:2], scalars[3] = [self.number, draw.randrange(12)], self.map_id
+            case "remove":
+                scalars[:2] = self.number, draw.randrange(12)
+            case "seen":
+                scalars[:2] = self.objects
+            case "goto":
+                scalars[:2], scalars[3] = [self.number, self.bridge], None
+            case "cancel":
+                scalars[:2] = self.number, self.bridge
+            case "state":
+                scalars[0], scalars[2] = draw.choice(self.commands)
+                scalars[4] = draw.random() < 0.3
+        return [pack(fields), *message[1:]]
 
 
 class CurvePeer:
@@ -107,6 +150,7 @@ class Attacker:
         self.small = _small(self.corpus.by_kind[args.kind], args.kind)
         self.valid = self._said_validly()
         self.runs = [Run(self._identity()) for _ in range(CONNECTIONS)]
+        self.room = Heard(own_name(self.runs[0].identity, args.keys))
         self.ring: deque[Recorded] = deque(maxlen=RING)
         self.counts: Counter[str] = Counter(sent=0, with_run=0, connections=0, closed=0, unanswered=0)
         self.heard: Counter[str] = Counter()
@@ -169,11 +213,22 @@ class Attacker:
             hello = self._hello(own_name(run.identity, self.args.keys), run.identity)
             self.ring.append(Recorded(run.identity, True, hello))
             run.speaker.send([hello])
+            if self.args.kind in ("state", "place") and run is not self.runs[0]:  # for the robot to answer
+                run.speaker.send([self.room.fill(self.draw, "goto", self.corpus.by_kind["goto"][0])])
         return run.speaker
 
     def _hello(self, name: str, identity: bytes) -> Message:
-        """A valid one: of a client for the kinds that only clients send."""
-        return self.corpus.hello(name, identity, "client" if 32 <= KINDS[self.args.kind] < 48 else "hello")
+        """A valid one: of a client for the kinds that only clients send; the first of them drives a robot."""
+        if not self._is_client:
+            return self.corpus.hello(name, identity)
+        header, *arrays = self.corpus.hello(name, identity, "client")
+        fields: Any = unpack(header)
+        fields[2][2] = self.args.kind in ("state", "place") or identity == self.runs[0].identity
+        return [pack(fields), *arrays]
+
+    @property
+    def _is_client(self) -> bool:
+        return 32 <= KINDS[self.args.kind] < 48
 
     def _hear(self, run: Run, messages: list[Message]) -> None:
         for parts in messages:
@@ -181,6 +236,8 @@ class Attacker:
             self.heard[kind] += 1
             if kind in ("welcome", "refused"):
                 run.welcome = kind == "welcome"
+            with contextlib.suppress(LookupError, TypeError, ValueError):
+                self.room.take(kind, parts)
 
     def _end(self, run: Run) -> None:
         if run.speaker is not None:
@@ -205,6 +262,8 @@ class Attacker:
             any_name = f"m{self.draw.randrange(10**6)}"
             name = any_name if self.draw.random() < 0.3 else own_name(identity, self.args.keys)
             message = self._hello(name, identity)
+        elif self._is_client:
+            message = self.room.fill(self.draw, self.args.kind, message)
         return mutate(self.draw, message)
 
     def _said_validly(self) -> list[Message]:
@@ -217,7 +276,8 @@ class Attacker:
     def _valid(self, identity: bytes) -> Message:
         if self.args.kind in ("hello", "client"):  # its own
             return self._hello(own_name(identity, self.args.keys), identity)
-        return self.draw.choice(self.valid)
+        message = self.draw.choice(self.valid)
+        return self.room.fill(self.draw, self.args.kind, message) if self._is_client else message
 
 
 def _small(messages: list[Message], kind: str) -> list[Message]:
@@ -249,7 +309,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--valid", action="store_true")
     parser.add_argument("--cpu", type=float, default=0.0)
-    parser.add_argument("--keys", nargs=3)
+    parser.add_argument("--keys", type=str.split)
     parser.add_argument("--peer")
     parser.add_argument("--ring", type=Path)
     return parser.parse_args(argv)

@@ -417,6 +417,7 @@ class Result:
     findings: list[str] = field(default_factory=list)
     figures: dict[str, Any] = field(default_factory=dict)
     reproducer: str | None = None
+    load: float = 0.0  # of the machine, the mean of the last minute
 
     def expect(self, holds: bool, otherwise: str) -> None:
         if not holds:
@@ -424,6 +425,7 @@ class Result:
 
     def write(self, folder: Path) -> Result:
         folder.mkdir(parents=True, exist_ok=True)
+        self.load = round(os.getloadavg()[0], 1)
         name = re.sub(r"[^\w+.-]+", "-", f"{self.attack}-{self.setup}")
         (folder / f"{name}.json").write_text(json.dumps(vars(self), indent=1) + "\n")
         say(f"{self.attack} [{self.setup}]: " + ("; ".join(self.findings) or "held"))

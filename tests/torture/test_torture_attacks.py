@@ -41,6 +41,9 @@ CASES = {name: Case() for name in ATTACKS if name != "streamed-hellos"} | {
     "false-loops": Case(MAP),
     "flood-image": Case(KEYS),
     "four-agents": Case(KEYS),
+    "client-hellos": Case(KEYS),
+    "client-objects": Case(KEYS),
+    "client-places": Case(KEYS),
 }
 ALSO = [
     ("reset-while-full", Case(KEYS)),
@@ -53,7 +56,7 @@ ALSO = [
 def attacked(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path) -> siege.Stay:
     def attack(edge: EdgeProgram) -> Program:
         more = ["--http", edge.http] if edge.http else []
-        more += ["--keys", *edge.keys.of(case.keys_of)] if edge.keys else []
+        more += ["--keys=" + " ".join(edge.keys.of(case.keys_of))] if edge.keys else []
         how = (
             "--corpus",
             traffic,

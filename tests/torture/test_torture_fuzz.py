@@ -59,7 +59,7 @@ def test_fuzz(kind: str, setup: Setup, form: Form, traffic: Path, tmp_path: Path
             "--seed",
             SEED,
         ]
-        keys = ["--keys", *edge.keys.of("eve")] if edge.keys else []
+        keys = ["--keys=" + " ".join(edge.keys.of("eve"))] if edge.keys else []
         return siege.python("fuzzer.py", tmp_path / "fuzzer.log", edge.address, *arguments, *keys, *more)
 
     most_s = 60 + 3 * form.count / form.rate
