@@ -18,6 +18,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera, project, rays
+from share.mapping.recognition.alignment_noise import aligned_sigma_px, depth_factor, whitened
 from share.mapping.recognition.depth_scale import DepthScale
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import F32, F64, I64, U8, KeyframeImage, View
@@ -34,16 +35,7 @@ _MIN_CORRELATION = 0.8
 _CONVERGED_PX = 0.3  # last step of a converged alignment
 _MAX_MAGNIFICATION = 3.0  # of a warped patch, or the inverse
 _MAX_STEPS = 8
-# Variance of an aligned position: what noise and a surface that is no plane leave of the correlation. By the
-# true poses of 156,000 patches, across the direction in which depth moves them: 0.16 px at a correlation of
-# 0.99, 0.20 at 0.97, 0.32 at 0.915, 0.46 at 0.825.
-_VARIANCE_PX2, _VARIANCE_PX2_PER_LOSS = 0.01, 1.15
-# How wrong a view's depths are, its residuals say: by the truth, features known to 7 % by their filter are so
-# to 1.5 %, those to 0.4 % to 0.35 %.
-_DEPTHS_JUDGED_AT = 1  # iteration
-_MIN_DEPTHS = 8  # features that depth moves by more than twice the noise
-_DEPTH_FACTORS = 0.2, 3.0  # on the sigmas of the depths, the least and the largest
-_MEDIAN_TO_SIGMA = 1.4826  # of absolute values
+_DEPTHS_JUDGED_AT = 1  # iteration from which depths are as sure as their residuals say
 _INLIER_CHI2 = 9.2  # 99 %, 2 degrees of freedom
 _CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
 _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
@@ -294,8 +286,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
         & (aligned.last_step < _CONVERGED_PX)
         & (distance_px < _REACH_PX)
     )
-    lost = 1 - aligned.correlation[good].astype(np.float64)
-    sigma_px = size * np.sqrt(_VARIANCE_PX2 + _VARIANCE_PX2_PER_LOSS * lost)
+    sigma_px = size * aligned_sigma_px(aligned.correlation[good].astype(np.float64))
     return _Alignment(index[good], size * aligned.px[good].astype(np.float64), sigma_px, len(index))
 
 
@@ -365,7 +356,7 @@ def _depth_scale(J: F64, r: F64, log_scales: F64) -> DepthScale | None:
 class _Residuals(NamedTuple):
     """Whitened: r (M, 2), measured minus predicted; its derivatives J_pose (M, 2, 6) of the prediction by the
     left perturbation of T, and J_scale (M, 2) by the log of the source's depths. depth_factor: as in
-    `_depth_factor`."""
+    `share.mapping.recognition.alignment_noise`."""
 
     r: F64
     J_pose: F64
@@ -386,31 +377,8 @@ def _residuals(
     J[:, :, 7] = alignment.px - target.camera.distort(uv)
     is_visible = np.isfinite(uv).all(axis=1)
     by_depth = by_rho * source.rho_sigma[index, None]
-    depth_factor = _depth_factor(J[:, :, 7], by_depth, alignment.sigma_px)
-    J = _whitened(J, alignment.sigma_px, factor * by_depth)
+    observed_factor = depth_factor(J[:, :, 7], by_depth, alignment.sigma_px)
+    J = whitened(J, alignment.sigma_px, factor * by_depth)
     J[~is_visible] = 0.0
     J[~is_visible, :, 7] = _NOT_VISIBLE
-    return _Residuals(J[:, :, 7], J[:, :, :6], J[:, :, 6], depth_factor)
-
-
-def _depth_factor(residual: F64, by_depth: F64, sigma_px: F64) -> float:
-    """Return how large the errors of a view's depths are, over their sigmas; 1 where too few tell.
-
-    residual (M, 2) px; by_depth (M, 2): by one sigma of the inverse depth; sigma_px (M,): of alignment."""
-    length = np.sqrt((by_depth * by_depth).sum(axis=1))
-    tells = length > 2 * sigma_px
-    if tells.sum() < _MIN_DEPTHS:
-        return 1.0
-    along = np.abs((residual * by_depth).sum(axis=1)[tells]) / length[tells] ** 2
-    return float(np.clip(_MEDIAN_TO_SIGMA * np.median(along), *_DEPTH_FACTORS))
-
-
-def _whitened(J: F64, sigma: F64, common: F64) -> F64:
-    """Return S^-1/2 J for rows J (M, 2, K) with covariance S = sigma^2 1 + common common' (M, 2, 2), sigma
-    (M,)."""
-    length = np.sqrt((common * common).sum(axis=1))
-    along = common / np.maximum(length, 1e-12)[:, None]
-    reduction = 1 - sigma / np.sqrt(sigma**2 + length**2)
-    part = (along[:, None, :] @ J) * reduction[:, None, None]  # (M, 1, K)
-    out: F64 = (J - along[:, :, None] * part) / sigma[:, None, None]
-    return out
+    return _Residuals(J[:, :, 7], J[:, :, :6], J[:, :, 6], observed_factor)
