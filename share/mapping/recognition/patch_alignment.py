@@ -18,7 +18,6 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera, project, rays
-from share.mapping.recognition.alignment_noise import aligned_sigma_px, depth_factor, whitened
 from share.mapping.recognition.depth_scale import DepthScale
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import F32, F64, I64, U8, KeyframeImage, View
@@ -35,7 +34,7 @@ _MIN_CORRELATION = 0.8
 _CONVERGED_PX = 0.3  # last step of a converged alignment
 _MAX_MAGNIFICATION = 3.0  # of a warped patch, or the inverse
 _MAX_STEPS = 8
-_DEPTHS_JUDGED_AT = 1  # iteration from which depths are as sure as their residuals say
+_SIGMA_PX = 0.2  # of an aligned position
 _INLIER_CHI2 = 9.2  # 99 %, 2 degrees of freedom
 _CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
 _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
@@ -211,12 +210,11 @@ def _verification(aligned: AlignedLoop, matches: int) -> Verification | Refusal:
 
 
 class _Alignment(NamedTuple):
-    """Features of one view that were aligned in the other. feature (M,): its index; px (M, 2): where;
-    sigma_px (M,): of that. predicted: number of features in the other view."""
+    """Features of one view that were aligned in the other. feature (M,): its index; px (M, 2): where.
+    predicted: number of features in the other view."""
 
     feature: I64
     px: F64
-    sigma_px: F64
     predicted: int
 
 
@@ -275,7 +273,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
         inside & (magnification < _MAX_MAGNIFICATION) & (magnification > 1 / _MAX_MAGNIFICATION)
     )
     if len(index) == 0:
-        return _Alignment(index, np.zeros((0, 2)), np.zeros(0), 0)
+        return _Alignment(index, np.zeros((0, 2)), 0)
     size = 2.0**level
     kernels = source.kernels(level)[index]
     images = (target.pyramid[level],)
@@ -286,8 +284,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
         & (aligned.last_step < _CONVERGED_PX)
         & (distance_px < _REACH_PX)
     )
-    sigma_px = size * aligned_sigma_px(aligned.correlation[good].astype(np.float64))
-    return _Alignment(index[good], size * aligned.px[good].astype(np.float64), sigma_px, len(index))
+    return _Alignment(index[good], size * aligned.px[good].astype(np.float64), len(index))
 
 
 class _AlignedPose(NamedTuple):
@@ -312,12 +309,10 @@ def _fit_pose(
     per px of the level. Raises LinAlgError where they do not determine it."""
     scale_sigma = np.array([query.shared_depth_sigma, candidate.shared_depth_sigma])
     prior = np.diag(np.concatenate([np.full(6, _RIDGE), scale_sigma**-2]))
-    log_scales, factors = np.zeros(2), np.ones(2)  # of the query's depths and the candidate's, and of sigmas
-    for iteration in range(_ITERATIONS):
-        at_candidate = _residuals(T, query, candidate, forward, log_scales[0], factors[0])
-        at_query = _residuals(se3.inverse(T), candidate, query, backward, log_scales[1], factors[1])
-        if iteration == _DEPTHS_JUDGED_AT:
-            factors = np.array([at_candidate.depth_factor, at_query.depth_factor])
+    log_scales = np.zeros(2)  # of the query's depths and the candidate's
+    for _ in range(_ITERATIONS):
+        at_candidate = _residuals(T, query, candidate, forward, size, log_scales[0])
+        at_query = _residuals(se3.inverse(T), candidate, query, backward, size, log_scales[1])
         r = np.concatenate([at_candidate.r, at_query.r])
         J, split = np.zeros((len(r), 2, 8)), len(at_candidate.r)
         J[:, :, :6] = np.concatenate([at_candidate.J_pose, at_query.J_pose @ -se3.adjoint(se3.inverse(T))])
@@ -330,7 +325,7 @@ def _fit_pose(
         gradient[6:] -= log_scales / scale_sigma**2
         step = np.linalg.solve(information, gradient)
         T, log_scales = se3.exp(step[:6]) @ T, log_scales + step[6:]
-        if iteration > _DEPTHS_JUDGED_AT and np.abs(step).max() < _CONVERGED_STEP * size:
+        if np.abs(step).max() < _CONVERGED_STEP * size:
             break
     inlier, cov = chi2 < _INLIER_CHI2, np.linalg.inv(information)
     depth_scale = _depth_scale(J[inlier], r[inlier], log_scales)
@@ -355,17 +350,15 @@ def _depth_scale(J: F64, r: F64, log_scales: F64) -> DepthScale | None:
 
 class _Residuals(NamedTuple):
     """Whitened: r (M, 2), measured minus predicted; its derivatives J_pose (M, 2, 6) of the prediction by the
-    left perturbation of T, and J_scale (M, 2) by the log of the source's depths. depth_factor: as in
-    `share.mapping.recognition.alignment_noise`."""
+    left perturbation of T, and J_scale (M, 2) by the log of the source's depths."""
 
     r: F64
     J_pose: F64
     J_scale: F64
-    depth_factor: float
 
 
 def _residuals(
-    T: F64, source: ImageView, target: ImageView, alignment: _Alignment, log_scale: float, factor: float
+    T: F64, source: ImageView, target: ImageView, alignment: _Alignment, size: float, log_scale: float
 ) -> _Residuals:
     index = alignment.feature
     uv, D, q, rho = _transfer(T, source, index, log_scale)
@@ -376,9 +369,17 @@ def _residuals(
     J[:, :, 6] = by_rho * rho[:, None]
     J[:, :, 7] = alignment.px - target.camera.distort(uv)
     is_visible = np.isfinite(uv).all(axis=1)
-    by_depth = by_rho * source.rho_sigma[index, None]
-    observed_factor = depth_factor(J[:, :, 7], by_depth, alignment.sigma_px)
-    J = whitened(J, alignment.sigma_px, factor * by_depth)
+    J = _whitened(J, size * _SIGMA_PX, by_rho * source.rho_sigma[index, None])
     J[~is_visible] = 0.0
     J[~is_visible, :, 7] = _NOT_VISIBLE
-    return _Residuals(J[:, :, 7], J[:, :, :6], J[:, :, 6], observed_factor)
+    return _Residuals(J[:, :, 7], J[:, :, :6], J[:, :, 6])
+
+
+def _whitened(J: F64, sigma: float, common: F64) -> F64:
+    """Return S^-1/2 J for rows J (M, 2, K) with covariance S = sigma^2 1 + common common' (M, 2, 2)."""
+    length = np.sqrt((common * common).sum(axis=1))
+    along = common / np.maximum(length, 1e-12)[:, None]
+    reduction = 1 - sigma / np.sqrt(sigma**2 + length**2)
+    part = (along[:, None, :] @ J) * reduction[:, None, None]  # (M, 1, K)
+    out: F64 = (J - along[:, :, None] * part) / sigma
+    return out
