@@ -107,6 +107,12 @@ class GoalStatus(StrEnum):
     def is_final(self) -> bool:
         return self in (GoalStatus.SUCCEEDED, GoalStatus.CANCELED, GoalStatus.ABORTED)
 
+    @classmethod
+    def of_ros(cls, number: int) -> GoalStatus:
+        """Return the state that ROS's number stands for."""
+        known = list(cls)
+        return known[number] if 0 <= number < len(known) else cls.UNKNOWN
+
 
 @dataclass(frozen=True)
 class StatusReceived:
