@@ -106,7 +106,8 @@ class NodeLink:
                 return []
             return self._events(message)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
-            self._say(f"what comes from the robot's node is not understood: {printable(str(error))[:80]}")
+            text = f"what comes from the robot's node is not understood: {printable(str(error))[:80]}"
+            self._say(text, "nonsense")
             return []
 
     def _events(self, message: dict[str, Any]) -> list[ev.RobotEvent]:
@@ -159,8 +160,8 @@ class NodeLink:
             self._gate.close()
         self._link.close()
 
-    def _say(self, text: str) -> None:
-        if (line := self._line_limiter.admit_new(text, time.monotonic_ns())) is not None:
+    def _say(self, text: str, kind: str | None = None) -> None:
+        if (line := self._line_limiter.admit_new(text, time.monotonic_ns(), kind)) is not None:
             self._print_line(line)
 
 
@@ -185,7 +186,8 @@ class _NodeGate:
                 self._requests.recv_multipart()
             )
             is_right = len(credentials) == 1 and z85.encode(credentials[0]).decode() == self._key
-            answer = [b"200", b"", b"node"] if is_right else [b"400", b"another key", b""]
+            # 300: temporary, so that libzmq tries again: --node-key may be mended
+            answer = [b"200", b"", b"node"] if is_right else [b"300", b"another key", b""]
             self._requests.send_multipart([version, number, *answer, b""])
             refused += not is_right
         return refused

@@ -102,7 +102,7 @@ class RobotTopics:
         self.under_way: list[str] = []  # ids of SHARE's goals on the robot
         self._frame, self._base, self._has = "odom", "base_link", ""
         self._stamps: dict[int, None] = {}  # of this node's newest map → odom
-        self._goals: list[list[Any]] | None = None
+        self._goals: list[list[Any]] = []
         self._was_ready = False
         latched = QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
@@ -167,10 +167,10 @@ class RobotTopics:
             "participants": len(node.get_node_names()) > 1,
             "has": self._has,
         }
-        self._was_ready = is_ready
         self.outgoing.append({"found": found})
-        if self._goals is not None and servers:
+        if found["servers"]:
             self.outgoing.append({"status": self._goals})
+        self._was_ready = is_ready
 
     # ------------------------------------------------------------ from the bridge
 

@@ -1,7 +1,8 @@
-"""The node on the robot and the bridge's link to it: freshness, keys; with a robot of rclpy, what DDS does."""
+"""The node on the robot and the bridge's link to it: freshness, keys; with a robot of rclpy, goals."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -95,7 +96,9 @@ class FakeNode:
         events: list[ev.RobotEvent] = []
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self.socket.send(self.fresh.stamped({"version": VERSION, **message}, time.monotonic_ns()))
+            with contextlib.suppress(zmq.Again):
+                data = self.fresh.stamped({"version": VERSION, **message}, time.monotonic_ns())
+                self.socket.send(data, zmq.NOBLOCK)
             time.sleep(0.02)
             events += self.link.poll(time.monotonic_ns())
             while self.socket.poll(0):
@@ -427,10 +430,10 @@ def test_dead_man_a_silent_bridge_stops_the_robot_and_map_odom(room: Callable[..
     took_s = time.monotonic() - began
     print(f"\na silent bridge → the goal has ended: {took_s:.1f} s")
     assert here.robot.of("ended")
+    time.sleep(1.0)
     here.robot.forget()
     time.sleep(1.0)
     assert here.robot.of("tf_missing") and not here.robot.of("tf")
-    assert "the bridge is silent" in here.nodes[0].log.read_text() or here.robot.of("ended")
 
 
 @in_ros
@@ -469,7 +472,7 @@ def test_a_node_that_dies_leaves_no_goal_and_the_next_one_drives(room: Callable[
     here.run(1.0)
     here.start_node()
     assert here.run(20.0, here.ended)
-    assert here.robot.of("ended") and here.reports[-1].text.startswith("stopped: no odometry for 0.5 s")
+    assert here.robot.of("ended") and not here.reports[-1].is_reached
     assert here.run(20.0, here.is_ready)
     here.reports.clear()
     here.drive()
@@ -483,7 +486,9 @@ def test_another_key_and_forged_messages_reach_nothing(room: Callable[..., NodeR
     for secret in (None, eve):
         with FakeNode(here.node, secret, here.keys.own.public) as node:
             for _ in range(30):
-                node.socket.send(b'{"version":1,"at":1,"seen":null,"odometry":[1,9,9,9,0]}')
+                with contextlib.suppress(zmq.Again):
+                    forged = b'{"version":1,"at":1,"seen":null,"odometry":[1,9,9,9,0]}'
+                    node.socket.send(forged, zmq.NOBLOCK)
             here.run(1.0)
     after = here.run_.bridge.report(time.monotonic_ns())["pose"]
     assert np.hypot(after[0] - before[0], after[1] - before[1]) < 1.5 and here.is_ready()
