@@ -33,6 +33,33 @@ _namespace = click.option(
     "--namespace", default="", metavar="NAME", help="The robot's namespace, such as tb1.  [default: none]"
 )
 
+_poses = click.option(
+    "--poses",
+    default="udp://127.0.0.1:5570",
+    metavar="udp://H:P",
+    help="Address to which the agent sends its poses, on this machine.",
+)
+_peers = click.option(
+    "--peer",
+    "peers",
+    metavar="HOST",
+    multiple=True,
+    help="The robot's address, for a network without multicast. May be repeated.",
+)
+_node = options.option_group(
+    click.option(
+        "--node",
+        "node_address",
+        metavar="tcp://H:P",
+        help="Listen here for the robot's node (`share robot node`), in place of DDS.",
+    ),
+    click.option(
+        "--node-key",
+        metavar="FILE|KEY",
+        help="Public key of the robot's node; required where it is on another machine. Turns on encryption.",
+    ),
+)
+
 
 _over_wire = options.option_group(
     room_options.edge("Reach the robot over this edge.  [default: the bridge on this machine]"),
@@ -68,34 +95,13 @@ def robot() -> None:
     type=options.PATH,
     help="YAML file: where the camera sits, where and how fast the robot may drive (docs/do/robot.md).",
 )
-@click.option(
-    "--poses",
-    default="udp://127.0.0.1:5570",
-    metavar="udp://H:P",
-    help="Address to which the agent sends its poses, on this machine.",
-)
+@_poses
 @click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
 @click.option("--allow-goals", is_flag=True, help="Let the robot move. Without this no goal is passed on.")
 @_domain
 @_namespace
-@click.option(
-    "--peer",
-    "peers",
-    metavar="HOST",
-    multiple=True,
-    help="The robot's address, for a network without multicast. May be repeated.",
-)
-@click.option(
-    "--node",
-    "node_address",
-    metavar="tcp://H:P",
-    help="Listen here for the robot's node (`share robot node`), in place of DDS.",
-)
-@click.option(
-    "--node-key",
-    metavar="FILE|KEY",
-    help="Public key of the robot's node; required where it is on another machine. Turns on encryption.",
-)
+@_peers
+@_node
 @room_options.edge("Take goals from this edge too, as the robot of --name.")
 @click.option("--name", help="Name of the robot at the edge: that of its agent.")
 @options.keys
@@ -206,6 +212,74 @@ def _poses_address(text: str) -> HostPort:
             f"run the bridge on the agent's machine, with udp://127.0.0.1:{host.port}"
         )
     return host
+
+
+@robot.command(short_help="Find where the camera sits, from a drive in eights.")
+@click.option(
+    "--robot",
+    "robot_file",
+    metavar="FILE",
+    required=True,
+    type=options.PATH,
+    help="The robot's YAML file: gets what is found; its height of the camera is kept.",
+)
+@_poses
+@click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
+@click.option(
+    "--seconds", default=90.0, show_default=True, help="How long you drive; Ctrl-C ends it earlier."
+)
+@_domain
+@_namespace
+@_peers
+@_node
+@options.keys
+@options.as_json
+def calibrate(
+    robot_file: Path,
+    poses: str,
+    agent: str | None,
+    seconds: float,
+    domain: int,
+    namespace: str,
+    peers: tuple[str, ...],
+    node_address: str | None,
+    node_key: str | None,
+    keys: Path | None,
+    as_json: bool,
+) -> None:
+    """Find where the camera sits on the robot, while you drive it in figures of eight, and write it to
+    --robot.
+
+    Drive by hand (teleop, a gamepad) on a level floor, 1 to 2 loops to each side, in place of the bridge, which
+    must not run. Exit code 1 if the drive does not show it.
+
+    \b
+    Example:  share robot calibrate --robot robot.yaml
+    """
+    from contextlib import ExitStack, closing
+
+    from share.files.writing import atomic_write
+    from share.files.yaml_file import read_yaml_text
+    from share.geometry.se3 import inverse
+    from share.net.udp import StampedSocket
+    from share.robot.mounting import find_mounting
+    from share.robot.robot_file import read_robot, with_mounting
+    from share.runtime.robot_drive import record_drive
+    from share.runtime.signals import stop_on_signal
+
+    before, live = inverse(read_robot(robot_file).settings.T_body_base), LiveLine()
+    where = _RobotAt(domain, namespace, peers, node_address, node_key, keys)
+    ended: list[bool] = []
+    with ExitStack() as stack:
+        link = stack.enter_context(closing(StampedSocket.bind(_poses_address(poses))))
+        node = stack.enter_context(closing(where.connect(live.print_line)))
+        stack.enter_context(stop_on_signal(lambda: ended.append(True)))
+        drive = record_drive(link, node, agent, seconds, lambda: bool(ended), live.write)
+    live.end()
+    found = find_mounting(drive, float(before[2, 3]))
+    text = with_mounting(read_yaml_text(robot_file), found.T_base_body)
+    atomic_write(robot_file, text)
+    click.echo(json.dumps(found.report()) if as_json else f"{found.text()}\nwritten to {robot_file}")
 
 
 @robot.command(short_help="Print the node that runs on a robot, for `bridge --node`.")

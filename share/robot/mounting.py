@@ -7,13 +7,14 @@ constant. So over any piece of the way, as complex numbers on the floor,
 
 with D the body's displacement, S the wheels' way summed along the body's heading, and E the change of
 exp(i heading). That is linear in a and b. Wheel odometry's own heading, which drifts, is not used but for the
-direction of one step. Roll and pitch are those of gravity in the body, since the floor is level; the height
+direction of one step. A delay of the wheels turns left and right bends against each other, and so falls
+out of an eight. Roll and pitch are those of gravity in the body, since the floor is level; the height
 does not show in such a drive.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,6 @@ _WINDOW_NS = 1_000_000_000
 _BLOCK = 4  # windows that are left out together: slip and drift last longer than one
 _MAX_GAP_NS = 300_000_000
 _MAX_STEP_M = 0.3  # between two poses; more is a jump of the odometry's origin
-_DELAYS_S = np.linspace(-0.2, 0.2, 41)
 _ITERATIONS = 10
 _MIN_WAY_M, _MIN_TURN_DEG, _MIN_BLOCKS = 2.0, 180.0, 4
 _MAX_SIGMA_M, _MAX_SIGMA_DEG, _MAX_SCALE = 0.01, 0.5, 0.1
@@ -65,7 +65,7 @@ class DriveExtent:
 @dataclass(frozen=True, eq=False)
 class Mounting:
     """T_base_body (4, 4), and one sigma of its parts. scale: of the way by the camera to that by the wheels,
-    less 1. delay_s: by which the wheels' samples are stamped late. residual_m: rms over a second."""
+    less 1. residual_m: rms over a second."""
 
     T_base_body: F64
     sigma_yaw_deg: float
@@ -73,9 +73,26 @@ class Mounting:
     sigma_y_m: float
     sigma_tilt_deg: float
     scale: float
-    delay_s: float
     residual_m: float
     extent: DriveExtent
+
+    def text(self) -> str:
+        """Return what was found, for a person."""
+        x, y, z = self.T_base_body[:3, 3]
+        ahead = self.T_base_body[:3, 2]
+        yaw, down = np.degrees(np.arctan2(ahead[1], ahead[0])), np.degrees(np.arcsin(-ahead[2]))
+        return (
+            f"the camera's body is {1e3 * x:.0f} ± {1e3 * self.sigma_x_m:.0f} mm ahead, "
+            f"{1e3 * y:.0f} ± {1e3 * self.sigma_y_m:.0f} mm left, {1e3 * z:.0f} mm up (as given); it looks "
+            f"{yaw:.1f} ± {self.sigma_yaw_deg:.1f}° to the left and {down:.1f} ± {self.sigma_tilt_deg:.1f}° down\n"
+            f"{self.extent.way_m:.1f} m driven; camera and wheels agree to {1e3 * self.residual_m:.0f} mm a second "
+            f"and {100 * self.scale:+.1f} % of the way"
+        )
+
+    def report(self) -> dict[str, object]:
+        """Return all of it as plain data."""
+        plain = asdict(self) | {"T_base_body": self.T_base_body.tolist()}
+        return plain
 
 
 def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
@@ -88,8 +105,7 @@ def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
         raise DataError(f"the drive does not show where the camera sits: {extent.missing}")
     if pieces.blocks < _MIN_BLOCKS:
         raise DataError(f"only {pieces.blocks * _BLOCK} s of poses and odometry go together; drive longer")
-    delay_s = pieces.best_delay()
-    fits = pieces.fits(delay_s)
+    fits = pieces.fits()
     yaw, x, y, scale = fits[0]
     spread = fits[1:] - fits[1:].mean(0)
     sigma = np.sqrt((len(spread) - 1) / len(spread) * (spread**2).sum(0))  # the jackknife's
@@ -107,9 +123,7 @@ def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
     R_base_level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     T_base_body = from_rt(R_base_level @ R_body_level.T, np.array([x, y, height_m]))
     sigmas = float(np.degrees(sigma[0])), float(sigma[1]), float(sigma[2])
-    return Mounting(
-        T_base_body, *sigmas, sigma_tilt, float(scale), delay_s, pieces.residual_m(delay_s), extent
-    )
+    return Mounting(T_base_body, *sigmas, sigma_tilt, float(scale), pieces.residual_m(), extent)
 
 
 def _level(R_odom_body: F64) -> tuple[F64, float]:
@@ -123,9 +137,7 @@ def _level(R_odom_body: F64) -> tuple[F64, float]:
     x /= np.linalg.norm(x)
     off = np.linalg.norm(np.cross(ups, up), axis=1)
     blocks = max(1, len(ups) // 100)
-    return np.stack([x, np.cross(up, x), up], axis=1), float(
-        np.degrees(np.sqrt((off**2).mean() / blocks))
-    )
+    return np.stack([x, np.cross(up, x), up], axis=1), float(np.degrees(np.sqrt((off**2).mean() / blocks)))
 
 
 class _Pieces:
@@ -153,7 +165,7 @@ class _Pieces:
 
     def _windows(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the first and last pose of each window without a gap or a jump."""
-        t, pad = self._time_ns, int(1e9 * max(_DELAYS_S))
+        t = self._time_ns
         if len(t) < 2 or len(self._wheel_ns) < 2:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         is_bad = (np.diff(t) > _MAX_GAP_NS) | (np.abs(np.diff(self._place)) > _MAX_STEP_M)
@@ -161,16 +173,16 @@ class _Pieces:
         wheel_bad = np.concatenate([[0], np.cumsum(np.diff(self._wheel_ns) > _MAX_GAP_NS)])
         edges = np.searchsorted(t, np.arange(t[0], t[-1], _WINDOW_NS))
         first, last = edges[:-1], edges[1:]
-        begin, end = t[first] - pad, t[last] + pad
+        begin, end = t[first], t[last]
         is_good = (bad[first] == bad[last]) & (begin >= self._wheel_ns[0]) & (end <= self._wheel_ns[-1])
         k = len(self._wheel_ns) - 1
         before, after = (np.searchsorted(self._wheel_ns, one).clip(0, k) for one in (begin, end))
         is_good &= wheel_bad[before] == wheel_bad[after]
         return first[is_good], last[is_good]
 
-    def _rows(self, delay_s: float) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    def _rows(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return A (n, 2) and D (n,)."""
-        way = np.interp(self._time_ns + 1e9 * delay_s, self._wheel_ns, self._way)
+        way = np.interp(self._time_ns, self._wheel_ns, self._way)
         middle = (self._heading[:-1] + self._heading[1:]) / 2
         along = np.concatenate([[0.0], np.cumsum(np.diff(way) * np.exp(1j * middle))])
         turned = np.exp(1j * self._heading)
@@ -188,22 +200,14 @@ class _Pieces:
             weight = 1 / (1 + (error / (2.5 * max(float(np.median(error)), 1e-6))) ** 2)
         return ab, weight
 
-    def residual_m(self, delay_s: float) -> float:
-        A, D = self._rows(delay_s)
+    def residual_m(self) -> float:
+        A, D = self._rows()
         ab, weight = self._solve(A, D)
         return float(np.sqrt((weight * np.abs(D - A @ ab) ** 2).sum() / weight.sum()))
 
-    def best_delay(self) -> float:
-        """Return the delay with the least residual, between the grid's by a parabola."""
-        cost = np.array([self.residual_m(one) ** 2 for one in _DELAYS_S])
-        k = int(np.clip(np.argmin(cost), 1, len(cost) - 2))
-        curve = cost[k - 1] - 2 * cost[k] + cost[k + 1]
-        shift = 0.0 if curve <= 0 else (cost[k - 1] - cost[k + 1]) / (2 * curve)
-        return float(_DELAYS_S[k] + np.clip(shift, -1, 1) * (_DELAYS_S[1] - _DELAYS_S[0]))
-
-    def fits(self, delay_s: float) -> F64:
+    def fits(self) -> F64:
         """Return yaw, x, y, scale of all windows, then without each block in turn (1 + blocks, 4)."""
-        A, D = self._rows(delay_s)
+        A, D = self._rows()
         block = np.arange(len(D)) // _BLOCK
         kept = [np.ones(len(D), bool), *(block != k for k in range(self.blocks))]
         return np.array([_parts(self._solve(A[one], D[one])[0]) for one in kept])

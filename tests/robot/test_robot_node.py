@@ -201,8 +201,10 @@ def test_of_two_nodes_only_the_first_is_heard_and_the_robot_is_two(link: NodeLin
 def test_a_node_that_is_silent_is_gone_and_the_next_is_heard(link: NodeLink, printed: list[str]) -> None:
     with FakeNode(link) as node:
         node.run()
-    time.sleep(SILENT_NS / 1e9 + 0.1)
-    link.poll(time.monotonic_ns())
+    end = time.monotonic() + 20
+    while len(printed) < 2 and time.monotonic() < end:
+        link.poll(time.monotonic_ns())
+        time.sleep(0.02)
     assert printed == ["the robot's node has connected", "the robot's node is gone"]
     with FakeNode(link) as node:
         assert node.run(foreign="map")
@@ -422,14 +424,14 @@ def test_cancel_and_a_lost_pose(room: Callable[..., NodeRoom]) -> None:
 
 @in_ros
 def test_dead_man_a_silent_bridge_stops_the_robot_and_map_odom(room: Callable[..., NodeRoom]) -> None:
-    here = room(drive_s=30.0)
+    here = room(drive_s=30.0, fault="patient")
     here.drive()
     began = time.monotonic()
     while not here.robot.of("ended") and time.monotonic() < began + 15:  # the bridge hangs
         time.sleep(0.02)
     took_s = time.monotonic() - began
     print(f"\na silent bridge → the goal has ended: {took_s:.1f} s")
-    assert here.robot.of("ended")
+    assert here.robot.of("ended") == [{"ended": "canceled"}]  # not for want of transforms
     time.sleep(1.0)
     here.robot.forget()
     time.sleep(1.0)
