@@ -250,8 +250,8 @@ def calibrate(
     """Find where the camera sits on the robot, while you drive it in figures of eight, and write it to
     --robot.
 
-    Drive by hand (teleop, a gamepad) on a level floor, 1 to 2 loops to each side, in place of the bridge, which
-    must not run. Exit code 1 if the drive does not show it.
+    Drive by hand (teleop, a gamepad) on a level floor, a loop or two to each side. The bridge must not run
+    meanwhile. Exit code 1 if the drive does not show it.
 
     \b
     Example:  share robot calibrate --robot robot.yaml

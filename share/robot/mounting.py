@@ -34,8 +34,8 @@ _MAX_SIGMA_M, _MAX_SIGMA_DEG, _MAX_SCALE = 0.01, 0.5, 0.1
 
 @dataclass(frozen=True, eq=False)
 class MountingDrive:
-    """A drive on a level floor. pose_ns (N,), T_odom_body (N, 4, 4): the agent's odometry, z up. wheel_ns (M,),
-    wheels (M, 3): the robot's, x, y m and yaw rad. Both times in one clock, rising."""
+    """A drive on a level floor. pose_ns (N,), T_odom_body (N, 4, 4): the agent's odometry, z up. wheel_ns
+    (M,), wheels (M, 3): the robot's, x, y m and yaw rad. Both times in one clock, rising."""
 
     pose_ns: I64
     T_odom_body: F64
@@ -84,9 +84,10 @@ class Mounting:
         return (
             f"the camera's body is {1e3 * x:.0f} ± {1e3 * self.sigma_x_m:.0f} mm ahead, "
             f"{1e3 * y:.0f} ± {1e3 * self.sigma_y_m:.0f} mm left, {1e3 * z:.0f} mm up (as given); it looks "
-            f"{yaw:.1f} ± {self.sigma_yaw_deg:.1f}° to the left and {down:.1f} ± {self.sigma_tilt_deg:.1f}° down\n"
-            f"{self.extent.way_m:.1f} m driven; camera and wheels agree to {1e3 * self.residual_m:.0f} mm a second "
-            f"and {100 * self.scale:+.1f} % of the way"
+            f"{yaw:.1f} ± {self.sigma_yaw_deg:.1f}° to the left and "
+            f"{down:.1f} ± {self.sigma_tilt_deg:.1f}° down\n"
+            f"{self.extent.way_m:.1f} m driven; camera and wheels agree to "
+            f"{1e3 * self.residual_m:.0f} mm a second and {100 * self.scale:+.1f} % of the way"
         )
 
     def report(self) -> dict[str, object]:
