@@ -80,7 +80,7 @@ def test_gaps_and_jumps_of_the_tracker_do_no_harm(drive: MountingDrive) -> None:
 
 @pytest.mark.long
 def test_another_robots_wheels_are_refused(drive: MountingDrive) -> None:
-    with pytest.raises(DataError, match="of the way|known to"):
+    with pytest.raises(DataError, match=r"of the way|known to"):
         find_mounting(replace(drive, wheels=drive.wheels * (0.6, 0.6, 1.0)))
     with pytest.raises(DataError, match="drive longer"):
         find_mounting(replace(drive, wheel_ns=drive.wheel_ns + 3600 * SECOND))
