@@ -191,7 +191,9 @@ class _Pieces:
         A = np.stack([along[j] - along[i], turned[j] - turned[i]], axis=1)
         return A, self._place[j] - self._place[i]
 
-    def _solve(self, A: NDArray[np.complex128], D: NDArray[np.complex128]) -> tuple[F64, F64]:
+    def _solve(
+        self, A: NDArray[np.complex128], D: NDArray[np.complex128]
+    ) -> tuple[NDArray[np.complex128], F64]:
         """Return (a, b) with Cauchy weights, and the weights (n,)."""
         weight = np.ones(len(D))
         for _ in range(_ITERATIONS):
@@ -214,7 +216,7 @@ class _Pieces:
         return np.array([_parts(self._solve(A[one], D[one])[0]) for one in kept])
 
 
-def _parts(ab: F64) -> tuple[float, float, float, float]:
+def _parts(ab: NDArray[np.complex128]) -> tuple[float, float, float, float]:
     a, b = ab
     yaw = -float(np.angle(a))
     t = b * np.exp(1j * yaw)
