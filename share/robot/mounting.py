@@ -198,7 +198,7 @@ class _Pieces:
         weight = np.ones(len(D))
         for _ in range(_ITERATIONS):
             AW = A.conj().T * weight
-            ab = np.linalg.solve(AW @ A + 1e-12 * np.eye(2), AW @ D)
+            ab = np.linalg.solve(AW @ A + 1e-12 * np.eye(2), AW @ D).astype(np.complex128)
             error = np.abs(D - A @ ab)
             weight = 1 / (1 + (error / (2.5 * max(float(np.median(error)), 1e-6))) ** 2)
         return ab, weight
