@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
     from share.net.udp import HostPort
+    from share.robot.node_link import NodeLink
+    from share.robot.ros_node import RosNode
 
 _domain = click.option(
     "--domain",
@@ -29,6 +32,33 @@ _domain = click.option(
 )
 _namespace = click.option(
     "--namespace", default="", metavar="NAME", help="The robot's namespace, such as tb1.  [default: none]"
+)
+
+_poses = click.option(
+    "--poses",
+    default="udp://127.0.0.1:5570",
+    metavar="udp://H:P",
+    help="Address to which the agent sends its poses, on this machine.",
+)
+_peers = click.option(
+    "--peer",
+    "peers",
+    metavar="HOST",
+    multiple=True,
+    help="The robot's address, for a network without multicast. May be repeated.",
+)
+_node = options.option_group(
+    click.option(
+        "--node",
+        "node_address",
+        metavar="tcp://H:P",
+        help="Listen here for the robot's node (`share robot node`), in place of DDS.",
+    ),
+    click.option(
+        "--node-key",
+        metavar="FILE|KEY",
+        help="Public key of the robot's node; required where it is on another machine. Turns on encryption.",
+    ),
 )
 
 
@@ -67,23 +97,13 @@ def robot() -> None:
     type=options.PATH,
     help="YAML file: where the camera sits, where and how fast the robot may drive (docs/do/robot.md).",
 )
-@click.option(
-    "--poses",
-    default="udp://127.0.0.1:5570",
-    metavar="udp://H:P",
-    help="Address to which the agent sends its poses, on this machine.",
-)
+@_poses
 @click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
 @click.option("--allow-goals", is_flag=True, help="Let the robot move. Without this no goal is passed on.")
 @_domain
 @_namespace
-@click.option(
-    "--peer",
-    "peers",
-    metavar="HOST",
-    multiple=True,
-    help="The robot's address, for a network without multicast. May be repeated.",
-)
+@_peers
+@_node
 @room_options.edge("Take goals from this edge too, as the robot of --name.")
 @click.option("--name", help="Name of the robot at the edge: that of its agent.")
 @options.keys
@@ -96,6 +116,8 @@ def bridge(
     domain: int,
     namespace: str,
     peers: tuple[str, ...],
+    node_address: str | None,
+    node_key: str | None,
     address: str | None,
     name: str | None,
     keys: Path | None,
@@ -105,7 +127,8 @@ def bridge(
 
     The robot moves only with --allow-goals, within the area and the speed of --robot, and while its place
     in the map is known: a pose that is lost, older than 0.5 s or unsure cancels the goal and ends map → odom.
-    With --edge it also takes goals of all whom the edge lets command robots.
+    With --edge it also takes goals of all whom the edge lets command robots. With --node it reaches a robot
+    that DDS from here does not, by way of a node on it.
 
     \b
     Example:  share robot bridge --robot robot.yaml --allow-goals
@@ -114,7 +137,6 @@ def bridge(
 
     from share.net.udp import StampedSocket
     from share.robot.robot_file import read_robot
-    from share.robot.ros_node import RosNode
     from share.runtime.robot_bridge import RobotBridgeRun
     from share.runtime.robot_commands import CommandServer, command_path
     from share.runtime.signals import stop_on_signal
@@ -126,22 +148,57 @@ def bridge(
     def print_line(text: str) -> None:
         live.print_line(f"share robot: {text}")
 
+    room_keys = keys if node_key is None or server_key is not None else None
     with ExitStack() as stack:
         room = None
         if address is not None:
             wants = {"drives_robot": True, "print_line": print_line}
             room = stack.enter_context(
-                closing(room_options.open_room(address, name or agent, keys, server_key, **wants))
+                closing(room_options.open_room(address, name or agent, room_keys, server_key, **wants))
             )
         link = stack.enter_context(closing(StampedSocket.bind(_poses_address(poses))))
         commands = stack.enter_context(closing(CommandServer(command_path(domain, namespace))))
-        node = stack.enter_context(closing(RosNode(domain, namespace, peers)))
+        where = _RobotAt(domain, namespace, peers, node_address, node_key, keys)
+        node = stack.enter_context(closing(where.connect(print_line)))
         run = RobotBridgeRun(replace(description, settings=settings), node, link, commands, print_line, room)
         with stop_on_signal(run.stop):
             moving = "goals are allowed" if allow_goals else "no goals (--allow-goals)"
-            print_line(f"domain {domain}, poses at {poses}, {moving}, at most {settings.max_speed_m_s:g} m/s")
+            print_line(f"{where}, poses at {poses}, {moving}, at most {settings.max_speed_m_s:g} m/s")
             run.run()
     live.end()
+
+
+@dataclass(frozen=True)
+class _RobotAt:
+    """How the robot is reached: by DDS, or by way of its node."""
+
+    domain: int
+    namespace: str
+    peers: tuple[str, ...]
+    node_address: str | None
+    node_key: str | None
+    keys: Path | None
+
+    def connect(self, print_line: Callable[[str], None]) -> RosNode | NodeLink:
+        """Return the connection. Raises UsageError for what does not go together."""
+        if self.node_address is None:
+            from share.robot.ros_node import RosNode
+
+            if self.node_key is not None:
+                raise UsageError("--node-key needs --node, the address at which the node finds the bridge")
+            return RosNode(self.domain, self.namespace, self.peers)
+        from share.net.keys import default_folder, load_pair, public_key
+        from share.robot.node_link import NodeKeys, NodeLink
+
+        if self.peers:
+            raise UsageError("--peer is for DDS: with --node the robot's node looks for the robot")
+        node_keys = None
+        if self.node_key is not None:
+            node_keys = NodeKeys(load_pair(self.keys or default_folder()), public_key(self.node_key))
+        return NodeLink(self.node_address, node_keys, print_line)
+
+    def __str__(self) -> str:
+        return f"domain {self.domain}" if self.node_address is None else f"node at {self.node_address}"
 
 
 def _poses_address(text: str) -> HostPort:
@@ -157,6 +214,89 @@ def _poses_address(text: str) -> HostPort:
             f"run the bridge on the agent's machine, with udp://127.0.0.1:{host.port}"
         )
     return host
+
+
+@robot.command(short_help="Find where the camera sits, from a drive in eights.")
+@click.option(
+    "--robot",
+    "robot_file",
+    metavar="FILE",
+    required=True,
+    type=options.PATH,
+    help="The robot's YAML file: gets what is found; its height of the camera is kept.",
+)
+@_poses
+@click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
+@click.option(
+    "--seconds", default=90.0, show_default=True, help="How long you drive; Ctrl-C ends it earlier."
+)
+@_domain
+@_namespace
+@_peers
+@_node
+@options.keys
+@options.as_json
+def calibrate(
+    robot_file: Path,
+    poses: str,
+    agent: str | None,
+    seconds: float,
+    domain: int,
+    namespace: str,
+    peers: tuple[str, ...],
+    node_address: str | None,
+    node_key: str | None,
+    keys: Path | None,
+    as_json: bool,
+) -> None:
+    """Find where the camera sits on the robot, while you drive it in figures of eight, and write it to
+    --robot.
+
+    Drive by hand (teleop, a gamepad) on a level floor, a loop or two to each side. The bridge must not run
+    meanwhile. Exit code 1 if the drive does not show it.
+
+    \b
+    Example:  share robot calibrate --robot robot.yaml
+    """
+    from contextlib import ExitStack, closing
+
+    from share.files.writing import atomic_write
+    from share.files.yaml_file import read_yaml_text
+    from share.geometry.se3 import inverse
+    from share.net.udp import StampedSocket
+    from share.robot.mounting import find_mounting
+    from share.robot.robot_file import read_robot, with_mounting
+    from share.runtime.robot_drive import record_drive
+    from share.runtime.signals import stop_on_signal
+
+    before, live = inverse(read_robot(robot_file).settings.T_body_base), LiveLine()
+    where = _RobotAt(domain, namespace, peers, node_address, node_key, keys)
+    ended: list[bool] = []
+    with ExitStack() as stack:
+        link = stack.enter_context(closing(StampedSocket.bind(_poses_address(poses))))
+        node = stack.enter_context(closing(where.connect(live.print_line)))
+        stack.enter_context(stop_on_signal(lambda: ended.append(True)))
+        drive = record_drive(link, node, agent, seconds, lambda: bool(ended), live.write)
+    live.end()
+    found = find_mounting(drive, float(before[2, 3]))
+    text = with_mounting(read_yaml_text(robot_file), found.T_base_body)
+    atomic_write(robot_file, text)
+    click.echo(json.dumps(found.report()) if as_json else f"{found.text()}\nwritten to {robot_file}")
+
+
+@robot.command(short_help="Print the node that runs on a robot, for `bridge --node`.")
+def node() -> None:
+    """Print the node for a robot that `share robot bridge` does not reach by DDS: one file, which runs with
+    the robot's own Python, rclpy and pyzmq, without SHARE.
+
+    \b
+    Example:  share robot node > share_robot_node.py
+    """
+    import inspect
+
+    from share.robot import share_robot_node
+
+    click.echo(inspect.getsource(share_robot_node), nl=False)
 
 
 @robot.command(short_help="Send the robot to a place.", context_settings={"ignore_unknown_options": True})

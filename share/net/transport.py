@@ -148,7 +148,7 @@ def bind_error(target: object, number: int | None, text: str, other: str = "edge
     return TransportError(f"{target}: {fixes.get(number or 0, f'cannot be bound: {text}')}")
 
 
-def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:
+def check_keys(target: Address, keys: object | None) -> Address:
     """Return `target`. Raises UsageError if it is on another machine and there are no keys."""
     if keys is None and not target.local:
         raise UsageError(

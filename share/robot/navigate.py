@@ -14,14 +14,6 @@ from share.robot import ros_types as types
 from share.robot.ros_topics import RosTopics, taken
 
 _ACTION = "navigate_to_pose/_action"
-_STATUSES = {
-    1: ev.GoalStatus.ACCEPTED,
-    2: ev.GoalStatus.EXECUTING,
-    3: ev.GoalStatus.CANCELING,
-    4: ev.GoalStatus.SUCCEEDED,
-    5: ev.GoalStatus.CANCELED,
-    6: ev.GoalStatus.ABORTED,
-}
 
 
 class NavigateClient:
@@ -48,7 +40,7 @@ class NavigateClient:
         events: list[ev.RobotEvent] = [
             ev.StatusReceived(
                 tuple(
-                    (bytes(goal.goal_info.goal_id.uuid), _STATUSES.get(goal.status, ev.GoalStatus.UNKNOWN))
+                    (bytes(goal.goal_info.goal_id.uuid), ev.GoalStatus.of_ros(goal.status))
                     for goal in message.status_list
                 )
             )

@@ -50,6 +50,7 @@ def _event(message: dict[str, Any]) -> AgentPoseReceived:
         None if in_map is None else _sigma_m(in_map["covariance"]),
         None if age_ms is None else round(1e6 * age_ms),
         has_edge if isinstance(has_edge, bool) else None,
+        None if message["odom"] is None else _pose(message["odom"]),
     )
 
 

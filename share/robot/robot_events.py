@@ -21,7 +21,8 @@ class AgentPoseReceived:
 
     T_map_body (4, 4), map_id: None without a pose in the map. sigma_m: standard deviation of the position
     on the floor; None if the agent does not know it. age_ns: of the frame; None if the agent does not say.
-    has_edge: whether the agent receives its edge's messages; None if not stated.
+    has_edge: whether the agent receives its edge's messages; None if not stated. T_odom_body (4, 4): by the
+    agent's own odometry, z up.
     """
 
     agent: str
@@ -32,6 +33,7 @@ class AgentPoseReceived:
     sigma_m: float | None
     age_ns: int | None
     has_edge: bool | None = None
+    T_odom_body: F64 | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,12 @@ class GoalStatus(StrEnum):
     @property
     def is_final(self) -> bool:
         return self in (GoalStatus.SUCCEEDED, GoalStatus.CANCELED, GoalStatus.ABORTED)
+
+    @classmethod
+    def of_ros(cls, number: int) -> GoalStatus:
+        """Return the state that ROS's number stands for."""
+        known = list(cls)
+        return known[number] if 0 <= number < len(known) else cls.UNKNOWN
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import secrets
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 from share.errors import WireError
 from share.geometry.se3 import inverse
@@ -18,18 +19,42 @@ from share.protocol.room_events import MessageWanted, RobotCommanded
 from share.robot import robot_events as ev
 from share.robot.bridge import RobotBridge
 from share.robot.goal_control import GOAL_PREFIX
+from share.robot.grid import FloorMap
+from share.robot.planar import PlanarPose
 from share.robot.pose_message import parse_pose_message
 from share.robot.robot_file import RobotDescription
-from share.robot.ros_node import RosNode
 from share.robot.wire_commands import WireCommands
 from share.runtime.robot_commands import CommandServer
 from share.runtime.room_link import RoomLink
 from share.timing import LineLimiter
+from share.types import F64
 from share.wire.room_messages import CommandState
 
 _TICK_S = 0.01  # odometry waits so long at most
 _END_NS = 2_000_000_000
 _MAX_DATAGRAMS = 64  # in one step
+
+
+class RobotConnection(Protocol):
+    """The robot's topics: by DDS (`RosNode`), or by way of a node on the robot (`NodeLink`)."""
+
+    def poll(self, now_ns: int) -> list[ev.RobotEvent]:
+        """Return what has come; never waits."""
+        ...
+
+    def publish_map_odom(self, stamp_ns: int, T_map_odom: PlanarPose) -> None: ...
+
+    def publish_body(self, T_base_body: F64) -> None: ...
+
+    def publish_grid(self, grid: FloorMap) -> None: ...
+
+    def limit_speed(self, speed_m_s: float) -> None: ...
+
+    def send_goal(self, goal: ev.SendGoal) -> None: ...
+
+    def cancel_goal(self, goal_id: bytes) -> None: ...
+
+    def ask_result(self, goal_id: bytes) -> None: ...
 
 
 class RobotBridgeRun:
@@ -38,7 +63,7 @@ class RobotBridgeRun:
     def __init__(
         self,
         robot: RobotDescription,
-        node: RosNode,
+        node: RobotConnection,
         poses: StampedSocket,
         commands: CommandServer,
         print_line: Callable[[str], None],

@@ -231,6 +231,18 @@ def test_too_fast_for_half_a_second_stops(drive: RobotDrive) -> None:
     assert stopped_for(drive, "0.30 m/s, 0.2 are allowed")
 
 
+def test_a_stopped_goal_that_the_robot_never_got_ends(drive: RobotDrive) -> None:
+    drive.goto()
+    drive.state = TrackState.LOST
+    drive.run(0.2)
+    drive.handle(ev.StatusReceived(()))
+    drive.run(1.0)
+    assert not drive.last_report.is_final  # it may be on its way
+    drive.run(4.0)
+    drive.handle(ev.StatusReceived(()))
+    assert drive.last_report.is_final and drive.last_report.text == "stopped: bot has lost tracking (LOST)"
+
+
 # ------------------------------------------------------------ which goals are taken
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import math
 import os
-import queue
 import re
 import signal
 import socket
@@ -21,27 +19,29 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import helpers.ros_messages
 import numpy as np
 import pytest
 import yaml
 from helpers.robot_drive import T_BASE_BODY, solid
 from helpers.room_server import RoomServer
+from helpers.ros_bench import (
+    AGE_S,
+    POSE_HZ,
+    ROS,
+    RosProcess,
+    RosRoom,
+    built_messages,
+    map_odom_at,
+    odometry_at,
+)
 
 from share import Room as ShareRoom
-from share.geometry.se3 import inverse
-from share.net.udp import HostPort, StampedSocket
 from share.robot import robot_events as ev
 from share.robot.planar import PlanarPose
-from share.robot.robot_file import RobotDescription
-from share.robot.settings import RobotSettings
 from share.runtime.pose import Pose
 from share.runtime.pose_feed import PoseMessages
-from share.runtime.room_link import RoomLink
 from share.types import TrackState
 
-ROS = os.environ.get("SHARE_ROS")
-HELPERS = Path(helpers.ros_messages.__file__).parent
 pytestmark = [
     pytest.mark.ros,
     pytest.mark.long,
@@ -51,177 +51,23 @@ pytestmark = [
 SECONDS = float(
     os.environ.get("SHARE_ROS_SECONDS", "15")
 )  # of the measurement of TF; 120 for docs/do/robot.md
-AGE_S, POSE_HZ = 0.015, 30
-
-
-def odometry_at(seconds: float) -> PlanarPose:
-    angle = 0.15 * seconds
-    return PlanarPose(math.sin(angle), 1 - math.cos(angle), angle)
-
-
-def map_odom_at(seconds: float) -> PlanarPose:
-    """What corrections make of the map: a step of 1.2 cm and 0.2° every 4 s, at 15 mm/s, beside a steady
-    drift."""
-    steps, into = divmod(seconds, 4.0)
-    moved = 0.012 * (steps + min(1.0, into / 0.8))
-    return PlanarPose(2.0 + moved, -1.0 + 0.002 * seconds, 0.4 + 0.3 * moved)
 
 
 @pytest.fixture(scope="session", params=["humble", "jazzy", "newer"])
-def messages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """The messages of a release, built once: release and folder."""
-    assert ROS is not None
-    folder = Path(ROS) / "share-test-messages" / request.param
-    if not (folder / "done").exists():
-        command = [f"{ROS}/bin/python", str(HELPERS / "ros_messages.py"), str(folder), request.param]
-        subprocess.run(command, check=True, capture_output=True)
-        (folder / "done").touch()
-    return request.param, folder
-
-
-class RosProcess:
-    """The node in its own process, and what it says."""
-
-    def __init__(
-        self,
-        folder: Path,
-        domain: int,
-        begin_s: float,
-        drive_s: float,
-        namespace: str = "",
-        fault: str = "",
-    ) -> None:
-        environment = {
-            **{key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
-            "PYTHONPATH": str(folder / "site"),
-            "LD_LIBRARY_PATH": str(folder / "lib"),
-            "ROS_DOMAIN_ID": str(domain),
-            "ROS_LOG_DIR": str(folder / "log"),
-        }
-        words = [str(begin_s), str(drive_s), namespace, fault]
-        command = [f"{ROS}/bin/python", str(HELPERS / "ros_robot.py"), *words]
-        self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-        self.lines: queue.Queue[dict] = queue.Queue()
-        self.said: list[dict] = []
-        self.thread = threading.Thread(target=self._read, daemon=True)
-        self.thread.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.put(json.loads(line))
-
-    def of(self, key: str) -> list[dict]:
-        """What it said under a key."""
-        while not self.lines.empty():
-            self.said.append(self.lines.get())
-        return [one for one in self.said if key in one]
-
-    def forget(self) -> None:
-        """Forget what it has said."""
-        self.of("")
-        self.said.clear()
-
-    def end(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        self.thread.join()
-        self.process.stdout.close()
-
-
-class Room:
-    """Agent, bridge and robot: `run` lets time pass."""
-
-    def __init__(
-        self,
-        folder: Path,
-        domain: int,
-        tmp_path: Path,
-        namespace: str = "",
-        drive_s: float = 2.0,
-        fault: str = "",
-        robots: tuple[str, ...] | None = None,
-        edge: str | None = None,
-    ) -> None:
-        from share.robot.ros_node import RosNode
-        from share.runtime.robot_bridge import RobotBridgeRun
-        from share.runtime.robot_commands import CommandServer
-
-        self.begin_s = time.time()
-        names = (namespace,) if robots is None else robots  # namespaces in which there is a robot
-        self.robots = [RosProcess(folder, domain, self.begin_s, drive_s, name, fault) for name in names]
-        self.robot = self.robots[0] if self.robots else None
-        self.poses = StampedSocket.bind(HostPort("127.0.0.1", 0))
-        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.commands = CommandServer(tmp_path / "robot.sock")
-        self.node = RosNode(domain, namespace, [])
-        settings = RobotSettings(inverse(T_BASE_BODY), allow_goals=True)
-        self.printed: list[str] = []
-        self.link = None if edge is None else RoomLink(edge, "bot", drives_robot=True)
-        self.run_ = RobotBridgeRun(
-            RobotDescription(settings), self.node, self.poses, self.commands, self.printed.append, self.link
-        )
-        self.reports: list[ev.GoalReport] = []
-        self.commands.report = self.reports.append  # type: ignore[method-assign]
-        self.messages, self.state = PoseMessages("bot"), TrackState.OK
-        self.next_s = time.time()
-
-    def send_pose(self) -> None:
-        stamp_s = time.time() - AGE_S
-        if not self.state.has_pose:
-            text = self.messages.of_state(round(stamp_s * 1e9), self.state, None)
-        else:
-            since = stamp_s - self.begin_s
-            T = solid(map_odom_at(since) @ odometry_at(since)) @ T_BASE_BODY
-            cov = np.eye(6) * 1e-4
-            pose = Pose(
-                round(stamp_s * 1e9), self.state, T, T, "ann-1/0", cov=cov, map_cov=cov, age_ms=AGE_S * 1e3
-            )
-            text = self.messages.of_pose(pose)
-        self.sender.sendto(text.encode(), ("127.0.0.1", self.poses.port))
-
-    def run(self, seconds: float, until: Callable[[], object] = lambda: False) -> bool:
-        """Go on until something is so, at most for a time. Return whether it is."""
-        end = time.time() + seconds
-        while time.time() < end:
-            if time.time() >= self.next_s:
-                self.next_s = max(self.next_s + 1 / POSE_HZ, time.time())
-                self.send_pose()
-            self.run_.step(min(0.01, max(0.0, self.next_s - time.time())))
-            if until():
-                return True
-        return bool(until())
-
-    def goto(self, x: float = 1.0, y: float = 0.5) -> None:
-        goal_id = self.run_._goal_id()
-        self.run_._handle(ev.GotoRequested("ann", goal_id, x, y))
-
-    def ended(self) -> bool:
-        return bool(self.reports) and self.reports[-1].is_final
-
-    def is_ready(self) -> bool:
-        return self.run_.bridge.report(time.monotonic_ns())["refusal"] is None
-
-    def close(self) -> None:
-        for robot in self.robots:
-            robot.end()
-        if self.link is not None:
-            self.link.close()
-        self.node.close()
-        self.commands.close()
-        self.poses.close()
-        self.sender.close()
+def messages(request: pytest.FixtureRequest) -> tuple[str, Path]:
+    """The messages of a release: release and folder."""
+    return request.param, built_messages(request.param)
 
 
 @pytest.fixture
 def room(
     messages: tuple[str, Path], tmp_path: Path, request: pytest.FixtureRequest
-) -> Iterator[Callable[..., Room]]:
-    rooms: list[Room] = []
+) -> Iterator[Callable[..., RosRoom]]:
+    rooms: list[RosRoom] = []
 
-    def open_room(is_ready: bool = True, **more: object) -> Room:
+    def open_room(is_ready: bool = True, **more: object) -> RosRoom:
         domain = 40 + os.getpid() % 60
-        rooms.append(Room(messages[1], domain, tmp_path, **more))
+        rooms.append(RosRoom(messages[1], domain, tmp_path, **more))
         if not is_ready:
             return rooms[-1]
         assert rooms[-1].run(30.0, rooms[-1].is_ready), rooms[-1].printed
@@ -232,7 +78,7 @@ def room(
         one.close()
 
 
-def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     if messages[0] != "jazzy":
         pytest.skip("tf2_msgs and nav_msgs are the same in all releases")
     here = room()
@@ -266,7 +112,7 @@ def test_map_to_base_and_the_map(messages: tuple[str, Path], room: Callable[...,
 
 
 def test_the_map_is_latched_and_the_body_is_known(
-    messages: tuple[str, Path], room: Callable[..., Room]
+    messages: tuple[str, Path], room: Callable[..., RosRoom]
 ) -> None:
     here = room()
     assert here.run(5.0, lambda: here.robot.of("map") and here.robot.of("static"))
@@ -276,7 +122,7 @@ def test_the_map_is_latched_and_the_body_is_known(
     assert here.robot.of("static")[-1]["static"] == [["base_link", "share_body"]]
 
 
-def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     here = room()
     assert here.run_.bridge.report(time.monotonic_ns())["release"] == messages[0]
     here.goto(1.5, 0.5)
@@ -287,7 +133,7 @@ def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., Room]
     assert here.robot.of("speed_limit")[-1]["speed_limit"] == 0.2
 
 
-def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     """A commander at an edge, the edge, the bridge, the robot's action server, and the states back."""
     count = int(os.environ.get("SHARE_ROS_GOALS", "3"))
     took_ms = []
@@ -315,7 +161,7 @@ def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., Roo
     )
 
 
-def test_cancel(room: Callable[..., Room]) -> None:
+def test_cancel(room: Callable[..., RosRoom]) -> None:
     here = room(drive_s=20.0)
     here.goto()
     assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
@@ -325,7 +171,7 @@ def test_cancel(room: Callable[..., Room]) -> None:
     assert here.robot.of("ended") == [{"ended": "canceled"}]
 
 
-def test_lost_pose_stops_the_robot(room: Callable[..., Room]) -> None:
+def test_lost_pose_stops_the_robot(room: Callable[..., RosRoom]) -> None:
     here = room(drive_s=20.0)
     here.goto()
     assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
@@ -337,14 +183,14 @@ def test_lost_pose_stops_the_robot(room: Callable[..., Room]) -> None:
     assert not here.robot.of("tf")[3:] and here.robot.of("tf_missing")
 
 
-def test_a_refused_goal(room: Callable[..., Room]) -> None:
+def test_a_refused_goal(room: Callable[..., RosRoom]) -> None:
     here = room()
     here.goto(500.0, 0.0)
     assert here.run(15.0, here.ended)
     assert "refuses the goal" in here.reports[-1].text or "no answer" in here.reports[-1].text
 
 
-def test_a_goal_that_fails_says_why(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+def test_a_goal_that_fails_says_why(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     here = room(drive_s=20.0)
     here.goto()
     assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
@@ -354,7 +200,7 @@ def test_a_goal_that_fails_says_why(messages: tuple[str, Path], room: Callable[.
     assert text in here.reports[-1].text
 
 
-def test_namespace(messages: tuple[str, Path], room: Callable[..., Room]) -> None:
+def test_namespace(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     if messages[0] != "jazzy":
         pytest.skip("names are the same in all releases")
     here = room(namespace="tb1")
@@ -377,7 +223,7 @@ def test_namespace(messages: tuple[str, Path], room: Callable[..., Room]) -> Non
     ],
 )
 def test_bad_input(
-    messages: tuple[str, Path], room: Callable[..., Room], more: dict[str, object], text: str
+    messages: tuple[str, Path], room: Callable[..., RosRoom], more: dict[str, object], text: str
 ) -> None:
     """One clear line, and nothing moves."""
     if messages[0] != "jazzy":

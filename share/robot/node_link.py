@@ -1,0 +1,237 @@
+"""The robot's topics by way of a node on the robot (`share_robot_node`), in place of DDS.
+
+The node connects here. With keys the link is encrypted (CURVE, RFC 26) and only the holder of the robot's key
+is let in (ZAP, RFC 27); without, only this machine: forged odometry steers the robot as a forged pose does.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import secrets
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import zmq
+from zmq.utils import z85
+
+from share.errors import printable
+from share.files.json_file import parse_json
+from share.geometry.se3 import quat_from_matrix
+from share.net.keys import KeyPair
+from share.net.transport import bind_error, check_keys, parse_address
+from share.net.zeromq_socket import ZmqSocket
+from share.robot import robot_events as ev
+from share.robot.grid import FloorMap
+from share.robot.planar import PlanarPose
+from share.robot.share_robot_node import HEARTBEAT_NS, SILENT_NS, VERSION, Freshness
+from share.timing import LineLimiter, PeriodicTimer
+from share.types import F64
+
+_ZAP_ENDPOINT, _ZAP_DOMAIN = "inproc://zeromq.zap.01", b"share-node"
+_OPTIONS: dict[int, int] = {zmq.ROUTER_MANDATORY: 1, zmq.SNDHWM: 50, zmq.MAXMSGSIZE: 1 << 16}
+_MAX_MESSAGES = 200  # in one poll
+_MAX_NODES = 8
+_FIXED_S = 2.0  # between two attempts to give the node the map
+
+
+@dataclass(frozen=True)
+class NodeKeys:
+    """The bridge's own pair, and the public key of the robot's node."""
+
+    own: KeyPair
+    node: str
+
+
+class NodeLink:
+    """Listens at `address` for the robot's node. print_line: takes lines for a person.
+
+    Raises UsageError for an address that other machines can reach without keys, TransportError if it cannot
+    be bound.
+    """
+
+    def __init__(self, address: str, keys: NodeKeys | None, print_line: Callable[[str], None]) -> None:
+        target = check_keys(parse_address(address, bind=True), keys)
+        self._print_line, self._line_limiter = print_line, LineLimiter()
+        self._nodes: dict[bytes, Freshness] = {}  # by the socket's name of each, oldest first
+        self._heard_ns: dict[bytes, int] = {}
+        self._sent_ns = 0
+        self._fixed: dict[str, Any] = {"name": secrets.token_hex(4)}
+        self._fixed_timer = PeriodicTimer(_FIXED_S)
+        self._link = ZmqSocket(zmq.ROUTER, _OPTIONS, target)
+        self._gate = None if keys is None else _NodeGate(self._link, keys)
+        try:
+            self._link.socket.bind(str(target))
+        except zmq.ZMQError as error:
+            self.close()
+            raise bind_error(target, error.errno, error.strerror, other="bridge") from None
+        self.endpoint = self._link.socket.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
+
+    # ------------------------------------------------------------ in
+
+    def poll(self, now_ns: int) -> list[ev.RobotEvent]:
+        """Return what has come; never waits."""
+        if self._gate is not None and self._gate.serve():
+            self._say(f"a node was refused: its key is not that of --node-key ({self.endpoint})")
+        events: list[ev.RobotEvent] = []
+        for _ in range(_MAX_MESSAGES):
+            if (parts := self._link.receive_now()) is None:
+                break
+            events += self._take(parts, now_ns)
+        for name in [one for one, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_NS]:
+            del self._heard_ns[name], self._nodes[name]
+            if not self._nodes:
+                self._print_line("the robot's node is gone")
+        if now_ns - self._sent_ns > HEARTBEAT_NS:
+            self._send({})
+        return events
+
+    def _take(self, parts: list[zmq.Frame], now_ns: int) -> list[ev.RobotEvent]:
+        name = parts[0].bytes
+        if len(parts) != 2 or (name not in self._nodes and len(self._nodes) >= _MAX_NODES):
+            return []
+        try:
+            message = parse_json(parts[1].bytes)
+            if message["version"] != VERSION:
+                self._say("the robot's node is of another release; write it anew with `share robot node`")
+                return []
+            if not self._nodes:
+                self._print_line("the robot's node has connected")
+            fresh = self._nodes.setdefault(name, Freshness(secrets.randbits(61)))
+            self._heard_ns[name] = now_ns
+            if not fresh.take(message, now_ns) or name != next(iter(self._nodes)):
+                return []
+            return self._events(message)
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
+            text = f"what comes from the robot's node is not understood: {printable(str(error))[:80]}"
+            self._say(text, "nonsense")
+            return []
+
+    def _events(self, message: dict[str, Any]) -> list[ev.RobotEvent]:
+        if "found" in message and message["found"]["has"] != self._fixed["name"]:
+            self._offer_fixed()
+        return node_events(message, time.time_ns(), len(self._nodes))
+
+    # ------------------------------------------------------------ out
+
+    def publish_map_odom(self, stamp_ns: int, T_map_odom: PlanarPose) -> None:
+        self._send({"tf": [stamp_ns, *_numbers(T_map_odom)]})
+
+    def publish_body(self, T_base_body: F64) -> None:
+        quat = quat_from_matrix(T_base_body[:3, :3])
+        self._fixed["body"] = [*T_base_body[:3, 3].tolist(), *quat.tolist()]
+
+    def publish_grid(self, grid: FloorMap) -> None:
+        self._fixed |= {
+            "size": list(grid.cells.shape),
+            "resolution": grid.resolution_m,
+            "origin": _numbers(grid.origin),
+            "cells": base64.b64encode(zlib.compress(grid.cells.tobytes(), 9)).decode(),
+        }
+
+    def _offer_fixed(self) -> None:
+        """Give the node the map and the body's place, until it says that it has them."""
+        if {"body", "size"} <= self._fixed.keys() and self._fixed_timer.fire_if_due(time.monotonic_ns()):
+            self._send({"fixed": self._fixed})
+
+    def limit_speed(self, speed_m_s: float) -> None:
+        self._send({"speed": speed_m_s})
+
+    def send_goal(self, goal: ev.SendGoal) -> None:
+        self._send({"goal": [goal.goal_id.hex(), goal.stamp_ns, *_numbers(goal.T_map_base)]})
+
+    def cancel_goal(self, goal_id: bytes) -> None:
+        self._send({"cancel": goal_id.hex()})
+
+    def ask_result(self, goal_id: bytes) -> None:
+        self._send({"ask": goal_id.hex()})
+
+    def _send(self, message: dict[str, Any]) -> None:
+        """Send to the node; nothing waits for one that is not there."""
+        self._sent_ns = time.monotonic_ns()
+        for name, fresh in list(self._nodes.items())[:1]:
+            self._link.send([name, fresh.stamped({"version": VERSION, **message}, self._sent_ns)])
+
+    def close(self) -> None:
+        if self._gate is not None:
+            self._gate.close()
+        self._link.close()
+
+    def _say(self, text: str, kind: str | None = None) -> None:
+        if (line := self._line_limiter.admit_new(text, time.monotonic_ns(), kind)) is not None:
+            self._print_line(line)
+
+
+class _NodeGate:
+    """Makes a socket a CURVE server that one key may enter. Must be created before the socket is bound."""
+
+    def __init__(self, link: ZmqSocket, keys: NodeKeys) -> None:
+        self._key = keys.node
+        socket = link.socket
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
+        socket.setsockopt(zmq.ZAP_DOMAIN, _ZAP_DOMAIN)
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it, a missing answer admits everyone
+        self._requests = link.context.socket(zmq.REP)
+        self._requests.bind(_ZAP_ENDPOINT)
+
+    def serve(self) -> int:
+        """Answer the handshakes that wait. Return how many were refused."""
+        refused = 0
+        while self._requests.poll(0):
+            version, number, _domain, _address, _identity, _mechanism, *credentials = (
+                self._requests.recv_multipart()
+            )
+            is_right = len(credentials) == 1 and z85.encode(credentials[0]).decode() == self._key
+            # 300: temporary, so that libzmq tries again: --node-key may be mended
+            answer = [b"200", b"", b"node"] if is_right else [b"300", b"another key", b""]
+            self._requests.send_multipart([version, number, *answer, b""])
+            refused += not is_right
+        return refused
+
+    def close(self) -> None:
+        self._requests.close(0)
+
+
+def node_events(message: dict[str, Any], unix_ns: int, nodes: int) -> list[ev.RobotEvent]:
+    """Return the events of a node's message. unix_ns: when it came. nodes: how many are connected. Raises
+    LookupError, TypeError or ValueError for what no node sends."""
+    events: list[ev.RobotEvent] = []
+    if "odometry" in message:
+        stamp_ns, *values = message["odometry"]
+        x, y, yaw, speed = (math.nan if one is None else float(one) for one in values)
+        events.append(ev.OdometryReceived(int(stamp_ns), unix_ns, PlanarPose(x, y, yaw), speed))
+    if "foreign" in message:
+        events.append(ev.ForeignMapFrame(str(message["foreign"])))
+    if "status" in message:
+        goals = ((bytes.fromhex(goal), status) for goal, status in message["status"])
+        known = tuple((goal, ev.GoalStatus.of_ros(status)) for goal, status in goals)
+        events.append(ev.StatusReceived(known))
+    if "feedback" in message:
+        goal, distance_m = message["feedback"]
+        events.append(ev.FeedbackReceived(bytes.fromhex(goal), float(distance_m)))
+    if "accepted" in message:
+        events.append(ev.GoalAnswered(bool(message["accepted"])))
+    if "result" in message:
+        code, text = message["result"]
+        events.append(ev.ResultReceived(int(code), str(text)))
+    if "found" in message:
+        found = message["found"]
+        others = tuple(printable(str(one))[:64] for one in found["others"][:8])
+        events.append(
+            ev.RobotDiscovered(
+                int(found["servers"]),
+                int(found["odometry"]) if nodes == 1 else nodes,
+                others,
+                printable(str(found["release"]))[:16],
+                has_participants=bool(found["participants"]),
+            )
+        )
+    return events
+
+
+def _numbers(pose: PlanarPose) -> list[float]:
+    return [pose.x, pose.y, pose.yaw]

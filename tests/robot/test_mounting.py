@@ -1,0 +1,131 @@
+"""Where the camera sits on the robot, from emulated drives: slip, unequal wheels, latency, noise."""
+
+from __future__ import annotations
+
+import json
+import socket
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers.mounting_drive import eight, mounting_drive
+from helpers.robot_drive import SECOND
+
+from share.cli.main import cli
+from share.errors import DataError
+from share.geometry.se3 import inverse, so3_log
+from share.robot import robot_events as ev
+from share.robot.mounting import MountingDrive, find_mounting
+from share.robot.planar import PlanarPose
+from share.robot.pose_message import parse_pose_message
+from share.robot.robot_file import T_base_of_camera, read_robot, with_mounting
+from share.runtime.pose import Pose
+from share.runtime.pose_feed import PoseMessages
+from share.runtime.robot_drive import DriveRecorder
+from share.types import TrackState
+
+TRUE = T_base_of_camera([0.09, -0.05, 0.21], yaw_deg=12.0, pitch_deg=8.0)
+
+
+def error(T_base_body: np.ndarray) -> tuple[float, float, float]:
+    """x and y, m; rotation, degrees."""
+    x, y, _ = T_base_body[:3, 3] - TRUE[:3, 3]
+    return x, y, float(np.degrees(np.linalg.norm(so3_log(TRUE[:3, :3] @ T_base_body[:3, :3].T))))
+
+
+@pytest.fixture(scope="module")
+def drive() -> MountingDrive:
+    return mounting_drive(TRUE, eight, 48.0, seed=31)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("late_s", [0.0, 0.06, -0.04])
+def test_a_drive_in_eights_finds_it(drive: MountingDrive, late_s: float) -> None:
+    late = replace(drive, wheel_ns=drive.wheel_ns + round(late_s * SECOND))
+    found = find_mounting(late, 0.21)
+    x, y, turned = error(found.T_base_body)
+    assert abs(x) < 0.004 and abs(y) < 0.004 and turned < 0.2
+    assert abs(x) < 5 * found.sigma_x_m and abs(y) < 5 * found.sigma_y_m
+    assert found.T_base_body[2, 3] == 0.21 and found.sigma_x_m < 0.003
+    assert "mm ahead" in found.text() and json.dumps(found.report())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        (lambda t: (0.2, 0.0), "turn by 180° and more to both sides"),
+        (lambda t: (0.2, 0.5), "0° to the right so far"),
+        (lambda t: (0.0, 0.8 if t < 15 else -0.8), "not only turn on the spot"),
+    ],
+)
+def test_a_drive_that_does_not_show_it_is_refused(command, text: str) -> None:
+    with pytest.raises(DataError, match="does not show where the camera sits") as refused:
+        find_mounting(mounting_drive(TRUE, command, 30.0, seed=32))
+    assert text in str(refused.value)
+
+
+@pytest.mark.long
+def test_gaps_and_jumps_of_the_tracker_do_no_harm(drive: MountingDrive) -> None:
+    poses = drive.T_odom_body.copy()
+    poses[300:, :3, 3] += (5.0, -2.0, 0.0)  # it began anew
+    kept = np.ones(len(poses), bool)
+    kept[400:430] = False
+    cut = replace(drive, T_odom_body=poses[kept], pose_ns=drive.pose_ns[kept])
+    x, y, turned = error(find_mounting(cut).T_base_body)
+    assert abs(x) < 0.005 and abs(y) < 0.005 and turned < 0.3
+
+
+@pytest.mark.long
+def test_another_robots_wheels_are_refused(drive: MountingDrive) -> None:
+    with pytest.raises(DataError, match=r"of the way|known to"):
+        find_mounting(replace(drive, wheels=drive.wheels * (0.6, 0.6, 1.0)))
+    with pytest.raises(DataError, match="drive longer"):
+        find_mounting(replace(drive, wheel_ns=drive.wheel_ns + 3600 * SECOND))
+
+
+def test_the_file_keeps_everything_else(tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(
+        "# mine\ncamera:\n  position_m: [0, 0, 0.2]\n\n# speed\nmax_speed_m_s: 0.1\n"
+        "area: [[0, 0], [2, 0], [2, 1]]\n"
+    )
+    for _ in range(2):  # and again over its own result
+        file.write_text(with_mounting(file.read_text(), TRUE))
+        settings = read_robot(file).settings
+        assert np.allclose(inverse(settings.T_body_base), TRUE, atol=1e-5)
+        assert settings.max_speed_m_s == 0.1 and settings.area is not None
+    assert "# mine\n# camera:\n#   position_m: [0, 0, 0.2]\n" in file.read_text()
+
+
+@pytest.mark.long
+def test_what_comes_live_is_recorded(drive: MountingDrive) -> None:
+    """Poses as the agent sends them and odometry by another clock, 8 to 30 ms on the way."""
+    recorder, messages = DriveRecorder(None), PoseMessages("bot")
+    rng, events = np.random.default_rng(5), []
+    for time_ns, T in zip(drive.pose_ns, drive.T_odom_body, strict=True):
+        pose = Pose(int(time_ns), TrackState.OK, T, None, None, age_ms=40.0)
+        event = parse_pose_message(messages.of_pose(pose).encode())
+        events.append((int(time_ns) + 40_000_000, event))
+    for time_ns, (x, y, yaw) in zip(drive.wheel_ns, drive.wheels, strict=True):
+        event = ev.OdometryReceived(int(time_ns) + 77 * SECOND, 0, PlanarPose(x, y, yaw), 0.2)
+        events.append((int(time_ns) + int(rng.uniform(8e6, 30e6)), event))
+    for now_ns, event in sorted(events, key=lambda one: one[0]):
+        recorder.add(event, now_ns)
+    x, y, turned = error(find_mounting(recorder.drive(), 0.21).T_base_body)
+    assert abs(x) < 0.004 and abs(y) < 0.004 and turned < 0.2
+    assert "m; drive in eights" in recorder.text
+
+
+def test_the_command_without_an_agent_changes_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text("camera: {position_m: [0, 0, 0.21]}\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        poses = f"udp://127.0.0.1:{free.getsockname()[1]}"
+    words = ["--robot", str(file), "--poses", poses, "--node", "tcp://127.0.0.1:0", "--seconds", "0.1"]
+    result = CliRunner().invoke(cli, ["robot", "calibrate", *words])
+    assert isinstance(result.exception, DataError) and "no poses came" in str(result.exception)
+    assert file.read_text() == "camera: {position_m: [0, 0, 0.21]}\n"
