@@ -86,8 +86,7 @@ class GoalControl:
         if status is None:
             if goal.status is not ev.GoalStatus.UNKNOWN:
                 return effects + self._end("the robot's navigation was restarted")
-            is_given_up = goal.stopped_ns is not None and now_ns - goal.sent_ns > seconds_to_ns(ACCEPT_S)
-            return effects + (self._end(f"stopped: {goal.stop_reason}") if is_given_up else [])
+            return effects
         if status is not goal.status:
             self.active = replace(goal, status=status)
             effects += self._on_new_status(self.active, status, now_ns)

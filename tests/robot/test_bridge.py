@@ -238,9 +238,10 @@ def test_a_stopped_goal_that_the_robot_never_got_ends(drive: RobotDrive) -> None
     drive.handle(ev.StatusReceived(()))
     drive.run(1.0)
     assert not drive.last_report.is_final  # it may be on its way
-    drive.run(4.0)
-    drive.handle(ev.StatusReceived(()))
-    assert drive.last_report.is_final and drive.last_report.text == "stopped: bot has lost tracking (LOST)"
+    drive.run(4.2)
+    assert drive.last_report.is_final and drive.last_report.text == (
+        "stopped: bot has lost tracking (LOST); the robot's navigation never took the goal"
+    )
 
 
 # ------------------------------------------------------------ which goals are taken

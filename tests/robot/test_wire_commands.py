@@ -381,7 +381,7 @@ def test_a_goal_for_the_only_robot_goes_on_where_a_second_one_comes(robot) -> No
     robot.bench.correct(robot.bench.agent("ann", 1), MAP, np.eye(4))
     robot.run(4)
     assert robot.has_goal
-    robot.bench.to_client(ann, ce.CommandWanted(room.Cancel(2, None)))  # that of its goal
+    robot.bench.to_client(ann, ce.MessageWanted(room.Cancel(2, None)))  # that of its goal
     robot.run(0.5)
     assert not robot.has_goal and robot.last(ann, 2).is_reached
 
