@@ -292,11 +292,9 @@ def node() -> None:
     \b
     Example:  share robot node > share_robot_node.py
     """
-    import inspect
-
     from share.robot import share_robot_node
 
-    click.echo(inspect.getsource(share_robot_node), nl=False)
+    click.echo(Path(share_robot_node.__file__).with_suffix(".py").read_text(), nl=False)
 
 
 @robot.command(short_help="Send the robot to a place.", context_settings={"ignore_unknown_options": True})

@@ -209,10 +209,9 @@ class ImuOutlierDetector:
 
     def _flag_suspects(self, stamps_ns: I64, steps: F64) -> None:
         """Flag each of these samples, with steps (N, 6), that is suspect."""
-        before = len(self._recent_steps)
         recent = np.concatenate([self._recent_steps, steps])
         for n in np.flatnonzero((steps > _SUSPECT_MARGIN).any(axis=1)).tolist():
-            end = before + n
+            end = len(self._recent_steps) + n
             recent_max = recent[max(0, end - _RECENT_STEPS) : end].max(axis=0, initial=0.0)
             self._flag_if_suspect(int(stamps_ns[n]), steps[n], recent_max)
 

@@ -74,6 +74,11 @@ def test_recordings_of_all_kinds_are_read_and_written(share, tmp_path):
         assert reported["streams"]["cam0"]["count"] == frames
 
 
+def test_the_node_of_a_robot_is_printed(share):
+    node = Path(__file__).parents[2] / "share" / "robot" / "share_robot_node.py"
+    assert share("robot", "node").stdout == node.read_text()
+
+
 def test_wrong_use_is_one_line(share):
     done = share("track", "nothing-here", code=2)
     assert len(done.stderr.splitlines()) == 1
