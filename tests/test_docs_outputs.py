@@ -224,7 +224,7 @@ def test_keys_of_report_json_are_those_that_the_code_writes(
     share: Callable[..., Any], plain_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, out = tmp_path / "quick.yaml", tmp_path / "out"
-    config.write_text("link: {silent_s: 0.2}\nagent: {finish_s: 0.1}")
+    config.write_text("link: {silent_s: 0.2}\nagent: {finish_s: 0.1, error_model: shipped}")
     source = ("--frames", "0:6", plain_session / "ar1")
     nobody = ("--edge", "tcp://127.0.0.1:9", "--name", "ann", "--kind", "ar")
     assert share("agent", *source, *nobody, "--config", config, "--out", out).code == 1
