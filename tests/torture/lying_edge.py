@@ -113,7 +113,7 @@ class LyingEdge:
         now = time.monotonic_ns()
         match kind:
             case "hello":
-                return [self.of("welcome", self.session, 0)]
+                return [self.of("welcome", self.session, 0, 0.0)]
             case "ping":
                 return [self.of("pong", scalars[0], scalars[1], now, now, self.session)]
             case "keyframe":
@@ -147,7 +147,8 @@ def welcomes(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
     """Another session with each answer, which goes on at a keyframe that is not there."""
     edge.session = edge.draw.getrandbits(62)
     out = edge.honest(kind, scalars)
-    return [edge.of("welcome", edge.session, edge.draw.choice((0, *IDS))), *out]
+    hold_ms = edge.draw.choice((0.0, 1.0, 1e4, -1.0, 1e300, math.inf, math.nan))
+    return [edge.of("welcome", edge.session, edge.draw.choice((0, *IDS)), hold_ms), *out]
 
 
 def corrections(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
@@ -177,7 +178,9 @@ def clock_far(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
 
 def rates(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
     out = edge.honest(kind, scalars)
-    return [*out, edge.of("rate", edge.draw.choice((0.0, 5e-324, 1e-300, 1000.0, -1.0, math.inf, math.nan)))]
+    numbers = (0.0, 5e-324, 1e-300, 1000.0, -1.0, math.inf, math.nan)
+    pose_hz = edge.draw.choice((None, *numbers))
+    return [*out, edge.of("rate", edge.draw.choice(numbers), edge.draw.random() < 0.5, pose_hz)]
 
 
 def refuses(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
