@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers.imu_simulation import GRAVITY, NOISE
+from helpers.imu_world import Path, imu_of
 
 from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import integrate
-from helpers.imu_simulation import GRAVITY, NOISE
-from helpers.imu_world import Path, imu_of
 
 IMU_HZ, FRAME_HZ, SECONDS = 200.0, 20.0, 2.0
 PHASES = 0.0, 0.1, 0.25, 0.5, 0.75, 0.9
