@@ -16,7 +16,7 @@ from share.net.connection_gate import Blocklist
 from share.net.connection_guard import ConnectionGuard
 from share.net.keys import EdgeKeys
 from share.net.transport import LINGER_MS, Address, IncomingMessage, bind_error, check_keys, parse_address
-from share.net.zeromq_socket import MAX_PARTS, WAKE, ZmqSocket
+from share.net.zeromq_socket import MAX_PARTS, WAKE, ZmqSocket, make_curve_server
 from share.wire.layouts import MAX_FRAME_BYTES, Bytes
 from share.wire.messages import PEER_ID_BYTES
 from share.wire.room_messages import Permission
@@ -25,7 +25,7 @@ _GUARD_WAKE = b"g"  # wakes the socket for the guard: look for a message, but do
 _MAX_REFUSALS = 128  # lines at a time
 _MAX_DISCARDED_PER_CALL = 2000  # messages from unidentified or disconnected peers, in one call
 _LIST_REFRESH_S = 0.1  # age of the cached allow list; reading it for each message was a quarter of the work
-_ZAP_ENDPOINT, _ZAP_DOMAIN = "inproc://zeromq.zap.01", b"share"
+_ZAP_DOMAIN = b"share"
 _OPTIONS: dict[int, int] = {
     zmq.ROUTER_MANDATORY: 1,  # sending to an absent peer is an error, not silent
     # An agent that returns over another network takes over from its half-open connection; without this,
@@ -209,12 +209,7 @@ class ZapAuthenticator:
         self._refusals: deque[str] = deque(maxlen=128)
         self._allowed = keys.allowed
         self._admitted_keys: set[str] = set()  # so far
-        socket.setsockopt(zmq.CURVE_SERVER, 1)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
-        socket.setsockopt(zmq.ZAP_DOMAIN, _ZAP_DOMAIN)
-        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it, a missing ZAP handler admits everyone
-        self._requests = context.socket(zmq.REP)
-        self._requests.bind(_ZAP_ENDPOINT)
+        self._requests = make_curve_server(context, socket, keys.own, _ZAP_DOMAIN)
         self._thread = Thread(target=self._serve, name="authenticator", daemon=True)
         self._thread.start()
 

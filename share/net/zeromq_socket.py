@@ -13,10 +13,12 @@ from collections.abc import Sequence
 import zmq
 
 from share.errors import TransportError
+from share.net.keys import KeyPair
 from share.net.transport import LINGER_MS, QUEUE_MESSAGES, Address
 from share.wire.layouts import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
 
 MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; further parts are read and discarded
+_ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 WAKE = b"w"  # written to the wake socket by `wake`
 _SKIPPED_PARTS_PER_CALL = 2000  # of a message with too many parts, in one call: 3 ms
 _COMMON_OPTIONS: dict[int, int] = {
@@ -100,3 +102,17 @@ class ZmqSocket:
         self.context.term()
         self._wake_reader.close()
         self._wake_writer.close()
+
+
+def make_curve_server(
+    context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], own: KeyPair, domain: bytes
+) -> zmq.Socket[bytes]:
+    """Make `socket` a CURVE server, before it is bound. Return the socket on which libzmq asks, for each
+    handshake, whether its key is admitted (ZAP, RFC 27)."""
+    socket.setsockopt(zmq.CURVE_SERVER, 1)
+    socket.setsockopt(zmq.CURVE_SECRETKEY, own.secret.encode())
+    socket.setsockopt(zmq.ZAP_DOMAIN, domain)
+    socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it, a missing ZAP handler admits everyone
+    requests = context.socket(zmq.REP)
+    requests.bind(_ZAP_ENDPOINT)
+    return requests

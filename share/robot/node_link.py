@@ -23,7 +23,7 @@ from share.files.json_file import parse_json
 from share.geometry.se3 import quat_from_matrix
 from share.net.keys import KeyPair
 from share.net.transport import bind_error, check_keys, parse_address
-from share.net.zeromq_socket import ZmqSocket
+from share.net.zeromq_socket import ZmqSocket, make_curve_server
 from share.robot import robot_events as ev
 from share.robot.grid import FloorMap
 from share.robot.planar import PlanarPose
@@ -31,7 +31,7 @@ from share.robot.share_robot_node import HEARTBEAT_NS, SILENT_NS, VERSION, Fresh
 from share.timing import LineLimiter, PeriodicTimer
 from share.types import F64
 
-_ZAP_ENDPOINT, _ZAP_DOMAIN = "inproc://zeromq.zap.01", b"share-node"
+_ZAP_DOMAIN = b"share-node"
 _OPTIONS: dict[int, int] = {zmq.ROUTER_MANDATORY: 1, zmq.SNDHWM: 50, zmq.MAXMSGSIZE: 1 << 16}
 _MAX_MESSAGES = 200  # in one poll
 _MAX_NODES = 8
@@ -170,13 +170,7 @@ class _NodeGate:
 
     def __init__(self, link: ZmqSocket, keys: NodeKeys) -> None:
         self._key = keys.node
-        socket = link.socket
-        socket.setsockopt(zmq.CURVE_SERVER, 1)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
-        socket.setsockopt(zmq.ZAP_DOMAIN, _ZAP_DOMAIN)
-        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it, a missing answer admits everyone
-        self._requests = link.context.socket(zmq.REP)
-        self._requests.bind(_ZAP_ENDPOINT)
+        self._requests = make_curve_server(link.context, link.socket, keys.own, _ZAP_DOMAIN)
 
     def serve(self) -> int:
         """Answer the handshakes that wait. Return how many were refused."""
