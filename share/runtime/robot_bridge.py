@@ -57,6 +57,13 @@ class RobotConnection(Protocol):
     def ask_result(self, goal_id: bytes) -> None: ...
 
 
+def received_pose(datagram: Datagram) -> ev.AgentPoseReceived:
+    """Return the pose of a datagram, as old as it is now. Raises WireError."""
+    pose = parse_pose_message(datagram.data)
+    waited_ns = max(0, time.time_ns() - datagram.stamp_ns)
+    return replace(pose, age_ns=(pose.age_ns or 0) + waited_ns)
+
+
 class RobotBridgeRun:
     """One bridge until `stop`. print_line: takes lines for a person. room: the edge that sends goals too."""
 
@@ -142,14 +149,13 @@ class RobotBridgeRun:
 
     def _take_pose(self, datagram: Datagram) -> None:
         try:
-            pose = parse_pose_message(datagram.data)
+            pose = received_pose(datagram)
         except WireError as error:
             line = self._line_limiter.admit_new(f"what comes as a pose is none: {error}", time.monotonic_ns())
             if line is not None:
                 self._print_line(line)
             return
-        waited_ns = max(0, time.time_ns() - datagram.stamp_ns)
-        self._handle(replace(pose, age_ns=(pose.age_ns or 0) + waited_ns))
+        self._handle(pose)
 
     def _handle(self, event: ev.RobotEvent) -> None:
         for effect in self.bridge.handle(event, time.monotonic_ns()):

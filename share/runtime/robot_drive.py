@@ -11,8 +11,7 @@ from share.errors import DataError, WireError
 from share.net.udp import StampedSocket
 from share.robot import robot_events as ev
 from share.robot.mounting import MountingDrive
-from share.robot.pose_message import parse_pose_message
-from share.runtime.robot_bridge import RobotConnection
+from share.runtime.robot_bridge import RobotConnection, received_pose
 from share.timing import PeriodicTimer, seconds_to_ns
 
 _WAIT_S, _SHOW_S = 0.01, 0.5
@@ -78,9 +77,8 @@ def record_drive(
         datagram = poses.receive(_WAIT_S)
         now_ns = time.monotonic_ns()
         if datagram is not None:
-            waited_ns = max(0, time.time_ns() - datagram.stamp_ns)
             try:
-                recorder.add(parse_pose_message(datagram.data), now_ns - waited_ns)
+                recorder.add(received_pose(datagram), now_ns)
             except WireError as error:
                 show(f"what comes as a pose is none: {error}")
         for event in robot.poll(now_ns):

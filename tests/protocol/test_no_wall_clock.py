@@ -23,7 +23,6 @@ ALLOWED = {
     "store/map_store.py": {"time.time"},  # when a keyframe came, for `edge.keep_days`
     "runtime/mapper_process.py": {"time.time"},
     "runtime/robot_bridge.py": {"time.time_ns"},  # how long a datagram has waited: the kernel stamps it so
-    "runtime/robot_drive.py": {"time.time_ns"},  # likewise
     "runtime/doctor.py": {"time.time"},  # how old a calibration's file is
 }
 
