@@ -15,6 +15,7 @@ does not show in such a drive.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,8 +93,7 @@ class Mounting:
 
     def report(self) -> dict[str, object]:
         """Return all of it as plain data."""
-        plain = asdict(self) | {"T_base_body": self.T_base_body.tolist()}
-        return plain
+        return asdict(self) | {"T_base_body": self.T_base_body.tolist()}
 
 
 def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
@@ -181,8 +181,9 @@ class _Pieces:
         is_good &= wheel_bad[before] == wheel_bad[after]
         return first[is_good], last[is_good]
 
-    def _rows(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return A (n, 2) and D (n,)."""
+    @cached_property
+    def _equations(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """A (n, 2) and D (n,)."""
         way = np.interp(self._time_ns, self._wheel_ns, self._way)
         middle = (self._heading[:-1] + self._heading[1:]) / 2
         along = np.concatenate([[0.0], np.cumsum(np.diff(way) * np.exp(1j * middle))])
@@ -190,6 +191,11 @@ class _Pieces:
         i, j = self._first, self._last
         A = np.stack([along[j] - along[i], turned[j] - turned[i]], axis=1)
         return A, self._place[j] - self._place[i]
+
+    @cached_property
+    def _solution(self) -> tuple[NDArray[np.complex128], F64]:
+        """(a, b) by all windows, and their weights (n,)."""
+        return self._solve(*self._equations)
 
     def _solve(
         self, A: NDArray[np.complex128], D: NDArray[np.complex128]
@@ -204,16 +210,15 @@ class _Pieces:
         return ab, weight
 
     def residual_m(self) -> float:
-        A, D = self._rows()
-        ab, weight = self._solve(A, D)
+        (A, D), (ab, weight) = self._equations, self._solution
         return float(np.sqrt((weight * np.abs(D - A @ ab) ** 2).sum() / weight.sum()))
 
     def fits(self) -> F64:
         """Return yaw, x, y, scale of all windows, then without each block in turn (1 + blocks, 4)."""
-        A, D = self._rows()
+        A, D = self._equations
         block = np.arange(len(D)) // _BLOCK
-        kept = [np.ones(len(D), bool), *(block != k for k in range(self.blocks))]
-        return np.array([_parts(self._solve(A[one], D[one])[0]) for one in kept])
+        without = (self._solve(A[block != k], D[block != k])[0] for k in range(self.blocks))
+        return np.array([_parts(ab) for ab in (self._solution[0], *without)])
 
 
 def _parts(ab: NDArray[np.complex128]) -> tuple[float, float, float, float]:
