@@ -33,7 +33,9 @@ _domain = click.option(
 _namespace = click.option(
     "--namespace", default="", metavar="NAME", help="The robot's namespace, such as tb1.  [default: none]"
 )
-
+_agent = click.option(
+    "--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]"
+)
 _poses = click.option(
     "--poses",
     default="udp://127.0.0.1:5570",
@@ -60,6 +62,10 @@ _node = options.option_group(
         help="Public key of the robot's node; required where it is on another machine. Turns on encryption.",
     ),
 )
+
+
+def _robot_file(text: str) -> Callable[[Any], Any]:
+    return click.option("--robot", "robot_file", metavar="FILE", required=True, type=options.PATH, help=text)
 
 
 _BRIDGE_ENDED = GoalUpdate("the bridge has ended", is_reached=False)  # what remains without an answer
@@ -89,16 +95,9 @@ def robot() -> None:
 
 
 @robot.command(short_help="Publish the robot's place in the map, and pass goals on.")
-@click.option(
-    "--robot",
-    "robot_file",
-    metavar="FILE",
-    required=True,
-    type=options.PATH,
-    help="YAML file: where the camera sits, where and how fast the robot may drive (docs/do/robot.md).",
-)
+@_robot_file("YAML file: where the camera sits, where and how fast the robot may drive (docs/do/robot.md).")
 @_poses
-@click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
+@_agent
 @click.option("--allow-goals", is_flag=True, help="Let the robot move. Without this no goal is passed on.")
 @_domain
 @_namespace
@@ -217,16 +216,9 @@ def _poses_address(text: str) -> HostPort:
 
 
 @robot.command(short_help="Find where the camera sits, from a drive in eights.")
-@click.option(
-    "--robot",
-    "robot_file",
-    metavar="FILE",
-    required=True,
-    type=options.PATH,
-    help="The robot's YAML file: gets what is found; its height of the camera is kept.",
-)
+@_robot_file("The robot's YAML file: gets what is found; its height of the camera is kept.")
 @_poses
-@click.option("--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]")
+@_agent
 @click.option(
     "--seconds", default=90.0, show_default=True, help="How long you drive; Ctrl-C ends it earlier."
 )
