@@ -329,9 +329,7 @@ def relative_pose(state: FilterState, a: int, b: int) -> F64:
 def relative_pose_cov(state: FilterState, a: int, b: int) -> F64:
     """Return the covariance (6, 6) of T_a_b between the keyframes with indices a and b, perturbed on the
     right."""
-    Ad = se3.adjoint(se3.inverse(state.keyframe_poses[b]))
-    out: F64 = Ad @ _relative_cov(state, state.keyframe_columns(a), state.keyframe_columns(b)) @ Ad.T
-    return (out + out.T) / 2 + _MIN_VARIANCE * np.eye(6)
+    return _at_keyframe(state, b, _relative_cov(state, state.keyframe_columns(a), state.keyframe_columns(b)))
 
 
 def relative_poses(state: FilterState, indices: I64, b: int) -> tuple[F64, F64]:
@@ -343,9 +341,7 @@ def relative_poses(state: FilterState, indices: I64, b: int) -> tuple[F64, F64]:
     P_ab = P[:, columns_b][columns]
     difference = P[columns[:, :, None], columns[:, None, :]] + P[columns_b, columns_b]
     difference -= P_ab + P_ab.swapaxes(1, 2)
-    Ad = se3.adjoint(se3.inverse(state.keyframe_poses[b]))
-    out = Ad @ difference @ Ad.T
-    return T_a_b, (out + out.swapaxes(1, 2)) / 2 + _MIN_VARIANCE * np.eye(6)
+    return T_a_b, _at_keyframe(state, b, difference)
 
 
 def motion_cov_since_keyframe(state: FilterState) -> F64:
@@ -368,6 +364,13 @@ def _motion_cov_since(state: FilterState, columns: slice) -> F64:
 def drift_m(state: FilterState) -> float:
     """Return the sigma, m, of the body's position relative to the newest keyframe."""
     return se3.position_sigma(motion_cov_since_keyframe(state))
+
+
+def _at_keyframe(state: FilterState, b: int, cov: F64) -> F64:
+    """Return covariances (..., 6, 6) of errors in odom as perturbations on the right of keyframe b."""
+    Ad = se3.adjoint(se3.inverse(state.keyframe_poses[b]))
+    out: F64 = Ad @ cov @ Ad.T
+    return (out + out.swapaxes(-1, -2)) / 2 + _MIN_VARIANCE * np.eye(6)
 
 
 def _relative_cov(state: FilterState, a: slice, b: slice) -> F64:

@@ -211,9 +211,8 @@ class ImuOutlierDetector:
         """Flag each of these samples, with steps (N, 6), that is suspect."""
         recent = np.concatenate([self._recent_steps, steps])
         for n in np.flatnonzero((steps > _SUSPECT_MARGIN).any(axis=1)).tolist():
-            end = len(self._recent_steps) + n
-            recent_max = recent[max(0, end - _RECENT_STEPS) : end].max(axis=0, initial=0.0)
-            self._flag_if_suspect(int(stamps_ns[n]), steps[n], recent_max)
+            before = recent[: len(self._recent_steps) + n][-_RECENT_STEPS:]
+            self._flag_if_suspect(int(stamps_ns[n]), steps[n], before.max(axis=0, initial=0.0))
 
     def _check_restart(self, window: _RestartWindow, stamps_ns: I64, values: F64) -> NDArray[np.bool_]:
         """Return which of these samples, which continue a restart, are accepted."""

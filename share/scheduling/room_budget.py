@@ -135,8 +135,12 @@ class RoomBudget:
     def air_s(self, agent: AgentAir) -> float:
         """Return T of an agent, s: what the edge sees of it, by as much longer as agents say that keyframes
         take. So what one says of itself is no gain to it over others."""
-        taken_s = self._usual_part * agent.seen_s
+        taken_s = self._taken_s(agent)
         return taken_s * self._idle / (1 + taken_s * self._keyframes_hz)
+
+    def _taken_s(self, agent: AgentAir) -> float:
+        """Return A of an agent, s, as it counts."""
+        return self._usual_part * agent.seen_s
 
     @property
     def load(self) -> float:
@@ -170,8 +174,7 @@ class RoomBudget:
         """Return the part of each agent's delay (N,) that is not the air's, at least what is usual of its
         form, of two the longer: nobody is served before others because it says that it is fast."""
         agents = list(self.agents.values())
-        taken_ms = [1e3 * self._usual_part * agent.seen_s for agent in agents]
-        other_ms = [max(0.0, agent.delay_ms - ms) for agent, ms in zip(agents, taken_ms, strict=True)]
+        other_ms = [max(0.0, agent.delay_ms - 1e3 * self._taken_s(agent)) for agent in agents]
         usual_ms = dict[AgentKind, float]()
         for form in {agent.terms.form for agent in agents}:
             of_form = [ms for agent, ms in zip(agents, other_ms, strict=True) if agent.terms.form is form]

@@ -16,10 +16,9 @@ from share.geometry import se3
 from share.lab.calibrate import handeye
 from share.lab.mocap.offset import correlate_rotations, mocap_rotations
 from share.lab.mocap.trajectory import MocapTrajectory
+from share.lab.mocap.verdict import MAX_ROTATION_SIGMA, MAX_TRANSLATION_SIGMA
 from share.types import F64
 
-MAX_ROTATION_SIGMA = np.radians(0.1)  # one sigma on the worst axis
-MAX_TRANSLATION_SIGMA = 0.003  # m, likewise
 MAX_OFFSET_SIGMA_S = 0.002
 _MAX_ROTATION_RMS = np.radians(1.0)  # of motions over a second; trackers of one head differ by 0.2 deg
 _MAX_TRANSLATION_RMS = 0.03  # m; likewise 5 mm
