@@ -202,3 +202,14 @@ class RosRoom:
         self.commands.close()
         self.poses.close()
         self.sender.close()
+
+
+def assert_goal_is_reached(here: RosRoom, release: str, within_s: float) -> None:
+    """Send a robot of this release to a place; check what it says, and what reached it."""
+    assert here.run_.bridge.report(time.monotonic_ns())["release"] == release
+    here.goto(1.5, 0.5)
+    assert here.run(within_s, here.ended), here.reports
+    texts = [report.text for report in here.reports]
+    assert texts[-1] == "reached" and any("to go" in text for text in texts)
+    assert here.robot.of("goal") == [{"goal": [1.5, 0.5], "frame": "map"}]
+    assert here.robot.of("speed_limit")[-1]["speed_limit"] == 0.2

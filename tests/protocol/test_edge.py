@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.edge_sim import MS, ModelRun, Person, Town, walls
 from helpers.hellos import hello_of
+from helpers.reports import recorded_reports
 
 from share.config import AgentQoe, Config, ControlConfig, EdgeConfig
 from share.geometry import se3
@@ -24,7 +25,6 @@ from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.common_events import PrintLine, Tick
 from share.protocol.edge import Edge
-from share.scheduling.policies import POLICIES
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -212,18 +212,12 @@ def test_a_name_is_free_at_once_after_a_bye():
 
 
 def test_the_scheduler_knows_who_shares_a_map_with_somebody(monkeypatch):
-    placed = []
-
-    class Recorder(POLICIES["share"]):
-        def evaluate(self, agent, report):
-            placed.append(report.is_placed)
-
-    monkeypatch.setitem(POLICIES, "share", Recorder)
+    reports = recorded_reports(monkeypatch)
     edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
 
     def evaluate() -> bool:
         tell(edge, 1, m.Evaluation(0, 50.0, 1.0))
-        return placed[-1]
+        return reports[-1].is_placed
 
     def join(name: str, run_id: int) -> str:
         return next(e.key for e in tell(edge, run_id, hello(name, run_id)) if isinstance(e, ed.AddRun))

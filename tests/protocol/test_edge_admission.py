@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.hellos import hello_of
+from helpers.reports import recorded_reports
 
 from share.config import Config, EdgeConfig
 from share.mapping.map_changes import SaveKeyframe, SaveRun
@@ -341,13 +342,7 @@ def test_policies_without_a_budget_turn_nobody_away():
 
 def test_the_edge_sees_how_long_a_keyframe_takes_to_arrive(monkeypatch):
     """From the message before it; of a copy, and of what arrives without one before, it learns nothing."""
-    seen = []
-
-    class Recorder(POLICIES["share"]):
-        def evaluate(self, agent, report):
-            seen.append(report.arrival_ms)
-
-    monkeypatch.setitem(POLICIES, "share", Recorder)
+    reports = recorded_reports(monkeypatch)
     edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
     said = m.Evaluation(0, 50.0, 1.0)
     come(edge, "ann", 1, 0.0)
@@ -358,4 +353,4 @@ def test_the_edge_sees_how_long_a_keyframe_takes_to_arrive(monkeypatch):
     tell(edge, 1, m.Ping(1, 1), 2.03)
     tell(edge, 1, keyframe(1), 2.05)
     tell(edge, 1, said, 3.0)
-    assert seen == pytest.approx([0.0, 50.0, 20.0])
+    assert [report.arrival_ms for report in reports] == pytest.approx([0.0, 50.0, 20.0])

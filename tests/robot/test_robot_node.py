@@ -17,7 +17,15 @@ import numpy as np
 import pytest
 import zmq
 from click.testing import CliRunner
-from helpers.ros_bench import ROS, RosRoom, built_messages, map_odom_at, odometry_at, ros_environment
+from helpers.ros_bench import (
+    ROS,
+    RosRoom,
+    assert_goal_is_reached,
+    built_messages,
+    map_odom_at,
+    odometry_at,
+    ros_environment,
+)
 
 from share.cli.main import cli
 from share.errors import TransportError, UsageError
@@ -385,13 +393,7 @@ def test_the_map_the_body_and_tf(room: Callable[..., NodeRoom]) -> None:
 @pytest.mark.parametrize("release", ["humble", "jazzy", "newer"])
 def test_a_goal_is_reached(room: Callable[..., NodeRoom], release: str) -> None:
     here = room(release, drive_s=1.5)
-    assert here.run_.bridge.report(time.monotonic_ns())["release"] == here.folder.name
-    here.goto(1.5, 0.5)
-    assert here.run(20.0, here.ended), here.reports
-    texts = [report.text for report in here.reports]
-    assert texts[-1] == "reached" and any("to go" in text for text in texts)
-    assert here.robot.of("goal") == [{"goal": [1.5, 0.5], "frame": "map"}]
-    assert here.robot.of("speed_limit")[-1]["speed_limit"] == 0.2
+    assert_goal_is_reached(here, here.folder.name, within_s=20.0)
 
 
 @in_ros

@@ -30,6 +30,7 @@ from helpers.ros_bench import (
     ROS,
     RosProcess,
     RosRoom,
+    assert_goal_is_reached,
     built_messages,
     map_odom_at,
     odometry_at,
@@ -124,13 +125,7 @@ def test_the_map_is_latched_and_the_body_is_known(
 
 def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     here = room()
-    assert here.run_.bridge.report(time.monotonic_ns())["release"] == messages[0]
-    here.goto(1.5, 0.5)
-    assert here.run(15.0, here.ended), here.reports
-    texts = [report.text for report in here.reports]
-    assert texts[-1] == "reached" and any("to go" in text for text in texts)
-    assert here.robot.of("goal") == [{"goal": [1.5, 0.5], "frame": "map"}]
-    assert here.robot.of("speed_limit")[-1]["speed_limit"] == 0.2
+    assert_goal_is_reached(here, messages[0], within_s=15.0)
 
 
 def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
