@@ -271,14 +271,14 @@ class KeyframeImage:
 
 
 @dataclass(frozen=True, eq=False)
-class KeyframeCandidate:
-    """A keyframe that the tracker offers, before the rate decides whether it is sent.
+class OdometryKeyframe:
+    """A keyframe of odometry, before the rate decides whether it is sent.
 
-    T_odom_body (4, 4): as published. T_previous_body (4, 4): motion since the previous candidate by the
+    T_odom_body (4, 4): as published. T_previous_body (4, 4): motion since the previous one by the
     filter's present estimate, which may differ from that of the two published T_odom_body; for the first of a
     segment it is T_odom_body. cov (6, 6): of T_previous_body. up (3,): unit vector against gravity in the
     body frame, zeros if unknown; up_sigma: of both its angles, rad. new_segment: odometry broke before this
-    keyframe. view, image: as in `Keyframe`. earlier: relative to earlier candidates.
+    keyframe. view, image: as in `Keyframe`. earlier: relative to earlier ones.
     """
 
     T_odom_body: F64

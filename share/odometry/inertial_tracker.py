@@ -27,7 +27,7 @@ from share.odometry.health import (
     pose_state,
 )
 from share.odometry.imu_predictor import ImuPredictor, ImuUse, mean_angular_rate
-from share.odometry.keyframes import KeyframeScheduler
+from share.odometry.keyframes import KeyframeWork
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
 from share.odometry.relocalisation import LocalMap
@@ -40,7 +40,7 @@ from share.types import (
     FeatureStatistics,
     Frame,
     ImuBatch,
-    KeyframeCandidate,
+    OdometryKeyframe,
     TrackState,
     View,
     WaitReason,
@@ -83,7 +83,7 @@ class InertialTracker:
         self._has_published = False
         self._knows_up = False  # the state began with IMU samples
         self._new_segment = False  # the next keyframe begins a segment
-        self._keyframes = KeyframeScheduler(config)
+        self._keyframes = KeyframeWork(config)
         self._realignment = TiltRealignment()
         self._start_cov: F64 | None = None  # of the pose in odom where the filter began; None: exact
         self._local_map = LocalMap()  # for relocalisation
@@ -121,14 +121,14 @@ class InertialTracker:
         self._last_frame, self._is_finished = frame, False
         return result
 
-    def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame) -> OdometryKeyframe:
         """Return the frame just tracked as a keyframe to publish; call it where `track` says that one is
         ready."""
         assert self._landmarks is not None
         new_segment, self._new_segment = self._new_segment, False
         published = self._keyframes.publish(self._landmarks, new_segment)
         knows_up = self._knows_up and published.tilt_sigma < _MAX_UP_SIGMA_RAD
-        return KeyframeCandidate(
+        return OdometryKeyframe(
             self._realignment.published_pose(published.T_odom_body),
             published.T_previous_body,
             published.cov,

@@ -135,8 +135,8 @@ KeyframeStep = Callable[[_PendingKeyframe, LandmarkMap, Frame, F64], None]
 Slice = list[tuple[KeyframeStep, _PendingKeyframe]]
 
 
-class KeyframeScheduler:
-    """Schedules the work of one tracker's keyframes."""
+class KeyframeWork:
+    """Spreads the work of one tracker's keyframes over frames, in slices."""
 
     def __init__(self, config: InertialConfig) -> None:
         self._spacing = KeyframeSpacing(config.keyframe_m, config.keyframe_rad, _MIN_SEEN_SHARE)

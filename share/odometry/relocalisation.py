@@ -46,7 +46,7 @@ def ransac_pose(
     return PoseEstimate(T, np.eye(6), inliers) if inliers.sum() >= 4 else None
 
 
-def refine_pose(
+def refine_absolute_pose(
     T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float, iterations: int = 8
 ) -> PoseEstimate:
     """Refine T_cam_world by Gauss-Newton on reprojection errors with Cauchy weights.
@@ -257,4 +257,6 @@ def _match_view(view: View, T_odom_cam: F64, uv: F64, descriptors: U8, focal: fl
     initial = ransac_pose(points, matched_uv, focal, RANSAC_PX)
     if initial is None:
         return None
-    return refine_pose(initial.T, points, matched_uv, focal, np.full(len(points), NOISE_PX), GATE_SIGMA)
+    return refine_absolute_pose(
+        initial.T, points, matched_uv, focal, np.full(len(points), NOISE_PX), GATE_SIGMA
+    )

@@ -26,7 +26,7 @@ from share.odometry.relocalisation import (
     LocalMap,
     PoseEstimate,
     ransac_pose,
-    refine_pose,
+    refine_absolute_pose,
 )
 from share.odometry.track_result import TrackResult, finite_median
 from share.types import (
@@ -36,7 +36,7 @@ from share.types import (
     U8,
     FeatureStatistics,
     Frame,
-    KeyframeCandidate,
+    OdometryKeyframe,
     TrackState,
     View,
     WaitReason,
@@ -109,7 +109,7 @@ class VisualTracker:
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
 
-    def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame) -> OdometryKeyframe:
         """Return the frame just tracked as a keyframe to publish; call it where `track` says that one is
         ready.
 
@@ -123,7 +123,7 @@ class VisualTracker:
         self._offered = frame, surfaces
         image = surfaces.with_image(frame.image0)
         up = np.zeros(3)
-        return KeyframeCandidate(
+        return OdometryKeyframe(
             T_odom_body, T_previous_body, cov, up, _UP_SIGMA_RAD, View.empty(), new_segment, image
         )
 
@@ -246,7 +246,7 @@ class VisualTracker:
         if initial is None or initial.inliers.sum() < MIN_INLIERS:
             return None, _NO_TRACKS
         sigma = np.full(len(points), NOISE_PX)
-        best = refine_pose(initial.T, points, uv, focal, sigma, GATE_SIGMA)
+        best = refine_absolute_pose(initial.T, points, uv, focal, sigma, GATE_SIGMA)
         if best.inliers.sum() < MIN_INLIERS:
             return None, _NO_TRACKS
         return best, tracks.take(best.inliers)

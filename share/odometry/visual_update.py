@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
+from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import Camera, rays
 from share.odometry import filter
 from share.odometry.feature_matching import FeatureMatches
 from share.odometry.filter import FeatureMeasurements
 from share.odometry.health import WEAK
 from share.odometry.landmarks import LASTING_PX, LandmarkMap
-from share.odometry.relocalisation import ransac_pose
 from share.odometry.state import POSE, FilterState, submatrix
 from share.odometry.track_result import median
 from share.types import F32, F64, I64
@@ -179,12 +179,12 @@ def consensus_inliers(state: FilterState, indices: I64, px: F32, camera: Camera)
     T_odom_anchor = state.keyframe_poses[state.anchor[indices]] @ state.T_body_cam
     in_anchor = rays(state.ray[indices]) / np.maximum(state.rho[indices, None], _MIN_RHO)
     points = (T_odom_anchor[:, :3, :3] @ in_anchor[:, :, None])[:, :, 0] + T_odom_anchor[:, :3, 3]
-    estimate = ransac_pose(
-        points, camera.normalise(px.astype(np.float64)), camera.focal, _CONSENSUS_PX, seed=0
-    )
-    if estimate is None or estimate.inliers.mean() < 0.5:
+    if len(points) < _MIN_GROUP:
         return np.ones(len(indices), bool)
-    return estimate.inliers
+    uv = camera.normalise(px.astype(np.float64))
+    _, inliers = absolute_pose(points, uv, camera.focal, RansacOptions(_CONSENSUS_PX, seed=0))
+    has_consensus = inliers.sum() >= max(_MIN_GROUP, 0.5 * len(indices))
+    return inliers if has_consensus else np.ones(len(indices), bool)
 
 
 def _grow_group(fit: _MotionFit, group: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
 """The agent's side of the protocol as a state machine, without sockets, threads or clock.
 
-`Agent.handle` takes one event and the time and returns effects, deterministically. Odometry passes through
-unchanged: the edge only moves the map under it.
+`AgentProtocol.handle` takes one event and the time and returns effects, deterministically. Odometry passes
+through unchanged: the edge only moves the map under it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
 from share.protocol.keyframe_pace import KeyframePace
 from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
 from share.timing import PeriodicTimer, seconds_to_ns
-from share.types import F64, Correction, KeyframeCandidate
+from share.types import F64, Correction, OdometryKeyframe
 from share.wire import messages as m
 from share.wire.codec import encode, message_bytes
 from share.wire.layouts import Bytes
@@ -44,7 +44,7 @@ _LEDGER_COUNTERS = (
 )
 
 
-class Agent:
+class AgentProtocol:
     """One run of one agent. `hello` is repeated until an edge welcomes it.
 
     It takes `FrameTracked` and `KeyframeMade`: it tracks its frames (else: `share.protocol.streaming`).
@@ -163,7 +163,7 @@ class Agent:
             last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
             self._send(pose_update(frame, T_odom_body, last, first, self._now_ns))
 
-    def _on_keyframe_made(self, frame: ev.FrameTracked, candidate: KeyframeCandidate | None) -> None:
+    def _on_keyframe_made(self, frame: ev.FrameTracked, candidate: OdometryKeyframe | None) -> None:
         """Make a keyframe of the candidate that came with `frame`, if the rate allows (else drop_rate)."""
         if candidate is None:
             self._finish_frame(replace(frame, is_keyframe=False), sent=False)

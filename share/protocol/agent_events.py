@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
-from share.types import F64, Frame, KeyframeCandidate, TrackState, WaitReason
+from share.types import F64, Frame, OdometryKeyframe, TrackState, WaitReason
 from share.wire.layouts import Bytes
 from share.wire.messages import Status
 
@@ -48,7 +48,7 @@ class KeyframeMade:
     """The keyframe candidate of a tracked frame, made after its pose was published; None if that failed."""
 
     frame: FrameTracked
-    candidate: KeyframeCandidate | None
+    candidate: OdometryKeyframe | None
 
 
 @dataclass(frozen=True, eq=False)

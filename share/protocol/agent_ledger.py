@@ -3,16 +3,15 @@ sent, acknowledged and due for a resend."""
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass, replace
-from statistics import median
 
 import numpy as np
 
 from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry.se3 import compose_cov, orthonormal
 from share.timing import seconds_to_ns
-from share.types import F64, Keyframe, KeyframeCandidate
+from share.types import F64, Keyframe, OdometryKeyframe
 from share.wire.messages import Ack, Welcome
 
 RESEND_S = 1.0  # first wait for an acknowledgement, at least; doubles with each resend
@@ -265,7 +264,7 @@ class KeyframeChain:
         self._has_reference = False
         self._reset_motion()
 
-    def extend(self, candidate: KeyframeCandidate) -> None:
+    def extend(self, candidate: OdometryKeyframe) -> None:
         """Add a candidate's motion, whether or not the candidate is sent."""
         if candidate.new_segment:
             self.begin_segment()
@@ -273,7 +272,7 @@ class KeyframeChain:
         self._T_keyframe_candidate = orthonormal(self._T_keyframe_candidate @ T)
         self._cov = compose_cov(T, self._cov, candidate.cov)
 
-    def make_keyframe(self, candidate: KeyframeCandidate, stamp_ns: int) -> Keyframe:
+    def make_keyframe(self, candidate: OdometryKeyframe, stamp_ns: int) -> Keyframe:
         """Return the candidate given to `extend` last as the next keyframe."""
         T_ref_body, cov, earlier = self._T_keyframe_candidate, self._cov, EarlierPoses.empty()
         if not self._has_reference:
@@ -333,27 +332,3 @@ def select_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
     rows = sorted({int(np.abs(steps - step).argmin()) for step in _EARLIER_STEPS if (steps > 1).any()})
     rows = [row for row in rows if steps[row] > 1]
     return earlier.take(rows, earlier.ids[rows].tolist())
-
-
-_SCORE_WINDOW = 20  # recent candidates with which one is compared
-_MAX_DEPTH_M = 20.0  # depth beyond which the score does not grow
-
-
-class KeyframeScore:
-    """Scores the keyframe candidates of an agent by their median depth: under a rate limit it prefers views
-    that are recognised more often.
-
-    A view of distant structure overlaps with views from elsewhere; a close-up is recognised from the same
-    spot only.
-    """
-
-    def __init__(self) -> None:
-        self._recent_scores: deque[float] = deque(maxlen=_SCORE_WINDOW)
-
-    def is_above_median(self, candidate: KeyframeCandidate) -> bool:
-        """Return whether the candidate scores at least the median of the recent ones, itself included."""
-        depth = candidate.points[:, 2]
-        valid = depth[np.isfinite(depth)]
-        score = float(np.median(valid.clip(0.0, _MAX_DEPTH_M))) if valid.size else 0.0
-        self._recent_scores.append(score)
-        return score >= median(self._recent_scores)

@@ -1,8 +1,8 @@
 """The edge's side of the protocol as a state machine: admission, acknowledgements, corrections.
 
-It uses no socket, thread, disk or clock: `Edge.handle` returns effects, which `share.runtime.edge` carries
-out. The mapper (`share.mapping.mapper`) runs in its own process and answers with findings; the map writer
-stores what must survive a crash and answers once it is on the disk.
+It uses no socket, thread, disk or clock: `EdgeProtocol.handle` returns effects, which `share.runtime.edge`
+carries out. The mapper (`share.mapping.mapper`) runs in its own process and answers with map events; the map
+writer stores what must survive a crash and answers once it is on the disk.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from share.mapping.map_changes import SaveKeyframe, SaveObject, SavePoses, SaveR
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.admission import RunRegistry
+from share.protocol.client_service import ClientService
 from share.protocol.common_events import Tick
 from share.protocol.edge_membership import RoomMembership, RunTrackers
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.keyframe_intake import KeyframeQuota, OdometryBase, sanitise
 from share.protocol.peer import Peer, RestoredRun, fault_warnings
-from share.protocol.room_desk import RoomDesk
 from share.protocol.versions import refusal_of_version
 from share.scheduling.policies import AgentReport
 from share.scheduling.rate_scheduler import RateScheduler
@@ -37,7 +37,7 @@ _NO_SESSION = 0  # in a pong to a client that the edge has forgotten: it says he
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 
-class Edge:
+class EdgeProtocol:
     """Serves all agents of one room.
 
     session: names this start of the edge, so that agents notice a restart. has_store: acknowledge a keyframe
@@ -61,8 +61,10 @@ class Edge:
         self.latest_poses = self._registry.latest_poses
         self._out = EdgeOutput(self._registry, has_store, began_ns)
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
-        self.room = RoomDesk(self._out, self._registry, session, config.edge.silent_s, objects)
-        self.room.restore(run.last_finding for run in restored if run.last_finding is not None)
+        self.room = ClientService(self._out, self._registry, session, config.edge.silent_s, objects)
+        self.room.restore(
+            run.last_correction_event for run in restored if run.last_correction_event is not None
+        )
         self._membership = RoomMembership(
             config,
             session,
@@ -94,8 +96,8 @@ class Edge:
                 self._on_message(event)
             case ed.MapperResult():
                 self._out.save(*event.changes)
-                for finding in event.findings:
-                    self._on_finding(finding)
+                for map_event in event.map_events:
+                    self._on_map_event(map_event)
                 self._registry.mark_empty(event.empty_runs)
                 for change in event.changes:
                     if isinstance(change, SavePoses):
@@ -251,21 +253,21 @@ class Edge:
             peer.computation.acknowledge(peer.durable_below, self._out.now_ns)
             self._out.send(peer.id, peer.reorder_buffer.ack(peer.durable_below))
 
-    def _on_finding(self, finding: MapEvent) -> None:
+    def _on_map_event(self, map_event: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
-        self.room.on_finding(finding)
-        if finding.agent is None:
-            self._out.record(finding.event, None, finding.reason, map_id=finding.map_id)
-        elif (peer := self._registry.by_key.get(finding.agent)) is None:
+        self.room.on_map_event(map_event)
+        if map_event.agent is None:
+            self._out.record(map_event.event, None, map_event.reason, map_id=map_event.map_id)
+        elif (peer := self._registry.by_key.get(map_event.agent)) is None:
             return  # forgotten in the meantime
-        elif finding.event == "odometry suspect":
-            self._suspect(peer, finding.reason)
-        elif finding.correction is None:
-            self._out.record(finding.event, peer, finding.reason, finding.event == "step failed")
+        elif map_event.event == "odometry suspect":
+            self._suspect(peer, map_event.reason)
+        elif map_event.correction is None:
+            self._out.record(map_event.event, peer, map_event.reason, map_event.event == "step failed")
         else:
-            peer.last_finding = finding
+            peer.last_correction_event = map_event
             if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
-                self._out.send_correction(peer, finding)
+                self._out.send_correction(peer, map_event)
 
     # ------------------------------------------------------------------ reports
 

@@ -42,7 +42,7 @@ class MapperResult:
     """Decisions of the mapper, and the changes that must survive a crash. empty_runs: runs that the map has
     nothing left of, each with its newest received keyframe."""
 
-    findings: Sequence[MapEvent]
+    map_events: Sequence[MapEvent]
     changes: Sequence[MapChange] = ()
     empty_runs: Sequence[KeyframeKey] = ()
 

@@ -10,9 +10,9 @@ from share.geometry.camera import Rig
 from share.mapping.map_changes import RemoveRun, SaveCredential
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
+from share.protocol.client_service import ClientService
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.peer import Peer
-from share.protocol.room_desk import RoomDesk
 from share.scheduling.rate_scheduler import RateScheduler
 from share.scheduling.room_budget import RateGrant
 from share.timing import seconds_to_ns
@@ -59,7 +59,7 @@ class RoomMembership:
         registry: RunRegistry,
         out: EdgeOutput,
         rate_scheduler: RateScheduler,
-        room: RoomDesk,
+        room: ClientService,
         trackers: RunTrackers,
     ) -> None:
         self._session, self._registry, self._out = session, registry, out
@@ -122,8 +122,8 @@ class RoomMembership:
         peer.grant = None
         first = self._rate_scheduler.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
         self.send_grant(peer, first)
-        if peer.last_finding is not None:
-            self._out.send_correction(peer, peer.last_finding, is_repeat=True)
+        if peer.last_correction_event is not None:
+            self._out.send_correction(peer, peer.last_correction_event, is_repeat=True)
 
     def _try_readmit(self, peer: Peer, message: wire.Message) -> bool:
         """Return whether a run that left is present again by this message."""

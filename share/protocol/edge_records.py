@@ -138,16 +138,16 @@ class EdgeOutput:
         self._registry.sender(peer_id).counts["bytes_down"] += message_bytes(frames)
         self.add(SendToPeer(peer_id, frames))
 
-    def send_correction(self, peer: Peer, finding: MapEvent, is_repeat: bool = False) -> None:
+    def send_correction(self, peer: Peer, map_event: MapEvent, is_repeat: bool = False) -> None:
         """Send a correction. is_repeat: sent again at the agent's request, so its record is throttled."""
-        assert finding.correction is not None
+        assert map_event.correction is not None
         peer.revision += 1
         peer.counts["corrections"] += 1
-        correction = replace(finding.correction, revision=peer.revision)
+        correction = replace(map_event.correction, revision=peer.revision)
         peer.computation.answer(correction.answered_keyframe, self.now_ns)
         self.send(peer.id, correction)
         answered = {"revision": peer.revision, "answers": correction.answered_keyframe}
-        self.record(finding.event, peer, finding.reason, is_repeat, map_id=correction.map_id, **answered)
+        self.record(map_event.event, peer, map_event.reason, is_repeat, map_id=correction.map_id, **answered)
 
     def count_bad_message(self, sender: CountedSender | None, reason: str, throttled: bool = False) -> None:
         """Count a bad message; record the first of each sender. throttled: as in `record`, for senders that a

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from statistics import median
 
-from share.protocol.agent_ledger import KeyframeScore
+import numpy as np
+
 from share.scheduling.base_delay import BaseDelay
 from share.timing import TokenBucket
-from share.types import KeyframeCandidate
+from share.types import OdometryKeyframe
 from share.wire.messages import Rate
 
 RATE_BURST = 2.0  # keyframes that may be saved up under a rate limit
@@ -69,7 +72,7 @@ class KeyframePace:
         """Return whether a pose is sent now."""
         return self._poses.take(now_ns)
 
-    def take(self, candidate: KeyframeCandidate, unacknowledged: int, now_ns: int) -> bool:
+    def take(self, candidate: OdometryKeyframe, unacknowledged: int, now_ns: int) -> bool:
         """Return whether this candidate is sent. unacknowledged: keyframes; 0 while the edge is away, for
         which they are kept."""
         is_preferred = self._score.is_above_median(candidate)
@@ -100,3 +103,27 @@ class KeyframeWindow:
         self._base = self._base.with_delay(ack_ms, now_ns)
         is_late = ack_ms > self._base.ms + LATE_MS
         self._size = max(1.0, self._size / 2) if is_late else min(MAX_KEYFRAMES, self._size + 1)
+
+
+_SCORE_WINDOW = 20  # recent candidates with which one is compared
+_MAX_DEPTH_M = 20.0  # depth beyond which the score does not grow
+
+
+class KeyframeScore:
+    """Scores the keyframe candidates of an agent by their median depth: under a rate limit it prefers views
+    that are recognised more often.
+
+    A view of distant structure overlaps with views from elsewhere; a close-up is recognised from the same
+    spot only.
+    """
+
+    def __init__(self) -> None:
+        self._recent_scores: deque[float] = deque(maxlen=_SCORE_WINDOW)
+
+    def is_above_median(self, candidate: OdometryKeyframe) -> bool:
+        """Return whether the candidate scores at least the median of the recent ones, itself included."""
+        depth = candidate.points[:, 2]
+        valid = depth[np.isfinite(depth)]
+        score = float(np.median(valid.clip(0.0, _MAX_DEPTH_M))) if valid.size else 0.0
+        self._recent_scores.append(score)
+        return score >= median(self._recent_scores)

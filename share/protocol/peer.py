@@ -142,7 +142,7 @@ class Peer(Sender):
     overload: Faults = field(default_factory=Faults)  # keyframes that were deferred; the agent resends them
     revision: int = 0
     is_gone: bool = False
-    last_finding: MapEvent | None = None  # newest correction, repeated with a welcome
+    last_correction_event: MapEvent | None = None  # newest correction, repeated with a welcome
     is_welcomed: bool = True  # in this session of the edge
     has_sent: bool = True  # a message in this session
     joined_ns: int | None = None  # first message in this session
@@ -159,7 +159,7 @@ class Peer(Sender):
     @property
     def map_id(self) -> str | None:
         """Map of its newest correction."""
-        correction = None if self.last_finding is None else self.last_finding.correction
+        correction = None if self.last_correction_event is None else self.last_correction_event.correction
         return None if correction is None else correction.map_id
 
     @property
@@ -233,13 +233,13 @@ def fault_lines(kinds: Iterable[tuple[str, str, Faults]], now_ns: int) -> list[s
 class RestoredRun:
     """A run stored by an earlier session of the edge.
 
-    odometry_base: its last keyframe; None without one. last_finding: its correction, sent with the welcome.
-    credential: as in `SaveRun`."""
+    odometry_base: its last keyframe; None without one. last_correction_event: sent with the
+    welcome. credential: as in `SaveRun`."""
 
     key: str
     hello: Hello
     odometry_base: OdometryBase | None
-    last_finding: MapEvent | None = None
+    last_correction_event: MapEvent | None = None
     credential: str | None = ""
 
     @property
@@ -258,7 +258,7 @@ class RestoredRun:
             durable_below=self.next_keyframe,
             odometry_base=self.odometry_base,
             is_gone=True,
-            last_finding=self.last_finding,
+            last_correction_event=self.last_correction_event,
             is_welcomed=False,
             has_sent=False,
             credential=self.credential,
@@ -279,7 +279,7 @@ def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRu
     merged_maps = set[str]().union(*(maps for maps in loops if len(maps) > 1))
     out = []
     for run in stored.runs:
-        base = finding = None
+        base = map_event = None
         if (keyframe := last.get(run.run_key)) is not None:
             base = OdometryBase.from_keyframe(keyframe)
             map_id, T_map_body = poses[KeyframeKey(run.run_key, keyframe.id)]
@@ -287,6 +287,6 @@ def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRu
                 T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(keyframe.T_odom_body))
                 is_own_map = map_id.startswith(f"{run.run_key}/")
                 cov = None if is_own_map else se3.inverse_cov(keyframe.T_odom_body, cov_body)
-                finding = map_assignment(run.run_key, map_id, T_map_odom, keyframe.id, cov)
-        out.append(RestoredRun(run.run_key, run.hello, base, finding, run.credential))
+                map_event = map_assignment(run.run_key, map_id, T_map_odom, keyframe.id, cov)
+        out.append(RestoredRun(run.run_key, run.hello, base, map_event, run.credential))
     return out

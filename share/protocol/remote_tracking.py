@@ -13,7 +13,7 @@ from share.config import Config
 from share.geometry import rig_check
 from share.geometry.camera import Rig
 from share.protocol import edge_events as ed
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_membership import RunTrackers
 from share.protocol.peer import Peer
 from share.protocol.streaming import FrameWindow
@@ -157,9 +157,9 @@ class RemoteTrackers(RunTrackers):
         return self._trackers[key].is_ready
 
 
-class TrackingEdge(Edge):
-    """An `Edge` without mapper and map writer. It emits `TrackerEffect` and takes `TrackerEvent`. capacity:
-    agents beyond it are refused; None: no limit."""
+class TrackingEdge(EdgeProtocol):
+    """An `EdgeProtocol` without mapper and map writer. It emits `TrackerEffect` and takes `TrackerEvent`.
+    capacity: agents beyond it are refused; None: no limit."""
 
     def __init__(
         self,

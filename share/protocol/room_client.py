@@ -14,7 +14,7 @@ from share.errors import UsageError
 from share.protocol import room_events as ev
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, SendToEdge, Tick
 from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
-from share.protocol.object_mirror import ObjectMirror
+from share.protocol.object_replica import ObjectReplica
 from share.timing import SECOND_NS, PeriodicTimer, seconds_to_ns
 from share.wire import messages as m
 from share.wire import room_messages as room
@@ -52,7 +52,7 @@ class RoomClient:
     def __init__(self, hello: room.ClientHello, silent_s: float, keeps_trying: bool = False) -> None:
         self._hello, self._keeps_trying = hello, keeps_trying
         self._connection = EdgeConnection(hello, silent_s, "it goes on trying")
-        self._mirror = ObjectMirror()
+        self._mirror = ObjectReplica()
         self._ping_timer, self._sequence = PeriodicTimer(_PING_S), 0
         self._pings: deque[m.Ping] = deque(maxlen=_MAX_PINGS)
         self._requests: dict[int, _OpenRequest] = {}

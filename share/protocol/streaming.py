@@ -10,7 +10,7 @@ from typing import Any
 
 from share.config import Config, StreamConfig
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import SendToEdge
 from share.timing import seconds_to_ns
 from share.types import Frame, ImuBatch
@@ -161,8 +161,8 @@ class FrameStreamer:
         return named | {"drop_frame": self._window.dropped, "unanswered": self._window.unanswered}
 
 
-class StreamingAgent(Agent):
-    """An `Agent` whose frames the edge tracks. It takes `FrameArrived` and sends neither poses nor
+class StreamingAgent(AgentProtocol):
+    """An `AgentProtocol` whose frames the edge tracks. It takes `FrameArrived` and sends neither poses nor
     keyframes."""
 
     offline_text = "no tracking without the edge"

@@ -25,7 +25,7 @@ _PLACE_S = 0.5
 
 
 @dataclass
-class _KnownCommand:
+class BridgeCommand:
     goal_id: bytes
     state: CommandState
     repeated_ns: int
@@ -46,7 +46,7 @@ class WireCommands:
     """
 
     def __init__(self) -> None:
-        self._known: dict[tuple[type, str, int], _KnownCommand] = {}
+        self._known: dict[tuple[type, str, int], BridgeCommand] = {}
         self._progress_timer, self._place_timer = PeriodicTimer(_PROGRESS_S), PeriodicTimer(_PLACE_S)
 
     def take(
@@ -70,11 +70,11 @@ class WireCommands:
         is_final = not goal_id
         state = CommandState(command.command, None, command.commander, text or "taken", is_final, is_reached)
         self._make_room()
-        self._known[key] = _KnownCommand(goal_id, state, now_ns, is_begun=is_final)
+        self._known[key] = BridgeCommand(goal_id, state, now_ns, is_begun=is_final)
         return events, [state]
 
     def _repeat(
-        self, known: _KnownCommand, command: Goto | Cancel, now_ns: int
+        self, known: BridgeCommand, command: Goto | Cancel, now_ns: int
     ) -> tuple[list[ev.RobotEvent], list[CommandState]]:
         """Hold a command that is known, unless that comes too late; begin it where it has not begun."""
         known.is_told = True

@@ -31,7 +31,7 @@ from share.metrics.frame_log import RunLog
 from share.net.transport import AgentLink
 from share.plain_data import to_mapping
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.agent_health import LIMITS
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.protocol.streaming import StreamingAgent
@@ -109,7 +109,7 @@ class AgentRun:
         self._source, self._settings = source, settings
         self._notify, self._show, self._verbose = notify, show, verbose
         self._guard = FaultGuard(notify)
-        self._state_machine = (StreamingAgent if hello.streams_frames else Agent)(hello, settings)
+        self._state_machine = (StreamingAgent if hello.streams_frames else AgentProtocol)(hello, settings)
         check_trackable(source.name, source.rig)  # before files are made and the edge sees this agent
         self._shared = _Shared()
         self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)

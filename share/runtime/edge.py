@@ -1,6 +1,6 @@
 """The edge process: one receive loop that never computes and never waits for a disk.
 
-link -> Edge (protocol) -> mapper process (share.runtime.mapper_process) -> findings -> Edge -> link
+link -> Edge (protocol) -> mapper process (share.runtime.mapper_process) -> map events -> Edge -> link
                         -> map writer thread (share.runtime.map_writer) -> saved changes -> acknowledgements
                         -> output writer thread (share.runtime.output_writer) -> events.jsonl, edge.json
      or with policy `streamed`
@@ -25,7 +25,7 @@ from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import (
     AddKeyframe,
     AddRun,
@@ -218,7 +218,7 @@ class EdgeRun:
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
         self._handover: KeyframeHandover  # where there is a mapper
-        self._state_machine: Edge
+        self._state_machine: EdgeProtocol
         if POLICIES[self._settings.edge.policy].streams_frames:
             self._state_machine = TrackingEdge(
                 self._settings, secrets.randbits(63), began_ns=self._start_ns, capacity=tracker_capacity()
@@ -233,7 +233,7 @@ class EdgeRun:
     ) -> None:
         store, writable = self._restarts.store, self._restarts.writable
         session, objects = secrets.randbits(63), self._restarts.objects or ()
-        self._state_machine = Edge(self._settings, session, writable, known, self._start_ns, objects)
+        self._state_machine = EdgeProtocol(self._settings, session, writable, known, self._start_ns, objects)
         arguments = (self._settings, None if store is None else store.path)
         self._mapper_process = WorkerProcess(
             "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
@@ -276,9 +276,9 @@ class EdgeRun:
     def _handle_answers(self) -> None:
         while not self._inbox.empty():
             match self._inbox.get():
-                case MapperResult() as findings:
-                    self._handle(findings)
-                    self._observer.add_result(findings)
+                case MapperResult() as result:
+                    self._handle(result)
+                    self._observer.add_result(result)
                 case ChangesSaved() | TrackerReady() | TrackerAnswered() as answer:
                     self._handle(answer)
                 case TrackerLost() as tracker if not self._stopping:

@@ -17,7 +17,7 @@ from share.odometry.error_model.inputs import error_model_input
 from share.odometry.error_model.network import ErrorEstimate, OnnxSession, estimate_error, open_error_model
 from share.odometry.track_result import TrackResult
 from share.timing import RingBuffer
-from share.types import U8, FeatureStatistics, Frame, KeyframeCandidate
+from share.types import U8, FeatureStatistics, Frame, OdometryKeyframe
 
 _MAX_TIMINGS = 50_000  # newest estimates that a report covers: hours at two keyframes a second
 
@@ -26,7 +26,7 @@ class KeyframeTracker(Protocol):
     """The part of a tracker that an error estimator uses."""
 
     def feature_statistics(self) -> FeatureStatistics: ...
-    def make_keyframe(self, frame: Frame) -> KeyframeCandidate: ...
+    def make_keyframe(self, frame: Frame) -> OdometryKeyframe: ...
 
 
 class ErrorEstimator(Protocol):
@@ -35,7 +35,7 @@ class ErrorEstimator(Protocol):
     def update(self, frame: Frame, result: TrackResult) -> float | None:
         """Add a tracked frame. Return the error, cm; None if unknown."""
 
-    def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> OdometryKeyframe:
         """Have `tracker` make the frame just tracked a keyframe, and use it as input for the next
         estimate."""
 
@@ -59,7 +59,7 @@ class NoErrorEstimate:
     def update(self, frame: Frame, result: TrackResult) -> float | None:
         return None
 
-    def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> OdometryKeyframe:
         return tracker.make_keyframe(frame)
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class SynchronousErrorModel(NoErrorEstimate):
         latest = self._latest
         return None if latest is None or result.T_odom_body is None else latest.error_cm
 
-    def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame, tracker: KeyframeTracker) -> OdometryKeyframe:
         statistics, candidate = tracker.feature_statistics(), tracker.make_keyframe(frame)
         recent_motion = self._odometer.add_keyframe(frame.stamp_ns, candidate)
         self._submit(_EstimateJob(frame.image0, statistics, recent_motion))

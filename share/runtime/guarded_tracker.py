@@ -17,7 +17,7 @@ from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.runtime.pipeline import make_tracker
 from share.timing import LineLimiter
-from share.types import F64, FeatureStatistics, Frame, KeyframeCandidate, TrackState
+from share.types import F64, FeatureStatistics, Frame, OdometryKeyframe, TrackState
 
 _MAX_TEXT = 160  # characters of an error
 
@@ -105,8 +105,8 @@ class GuardedTracker:
         self,
         frame: Frame,
         is_keyframe: bool,
-        make_keyframe: Callable[[Frame, GuardedTracker], KeyframeCandidate] | None = None,
-    ) -> KeyframeCandidate | None:
+        make_keyframe: Callable[[Frame, GuardedTracker], OdometryKeyframe] | None = None,
+    ) -> OdometryKeyframe | None:
         """Finish the frame just tracked where its keyframe is not sent before. is_keyframe: make it a
         keyframe, by `make_keyframe` where one is given."""
         candidate = None
@@ -118,7 +118,7 @@ class GuardedTracker:
         self.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
         return candidate
 
-    def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame) -> OdometryKeyframe:
         """Call within `attempt`, like `finish_keyframe` and `feature_statistics`."""
         candidate = self._tracker.make_keyframe(frame)
         self.bias = self._tracker.bias or self.bias

@@ -27,8 +27,8 @@ class MapWriter:
 
     While the file cannot be written, changes are held in memory and retried. Their number is bounded: an
     agent sends at most its window without an acknowledgement, the edge accepts a bounded number
-    (`share.protocol.edge`), of objects too (`share.protocol.object_desk`), loops arise from keyframes only,
-    and of solutions only the newest is held.
+    (`share.protocol.edge`), of objects too (`share.protocol.object_service`), loops arise from keyframes
+    only, and of solutions only the newest is held.
     """
 
     def __init__(

@@ -108,7 +108,7 @@ class _MapperProcess:
         self._running_solve: SolveStep | None = None
         self._solve_start_s = 0.0
         self._keyframe_queue = FairQueue[AddKeyframe]()
-        self._findings: list[MapEvent] = []
+        self._map_events: list[MapEvent] = []
         self._report_due_s = self._poses_due_s = self._expire_due_s = 0.0  # monotonic
         self._has_new_poses = False
         self._heap = HeapTrimmer()
@@ -120,7 +120,9 @@ class _MapperProcess:
         finally:  # a process does not end while a child of it runs
             self._solver.close()
         self._answer(
-            MapperResult(tuple(self._findings), (*self._mapper.take_changes(), self._mapper.current_poses()))
+            MapperResult(
+                tuple(self._map_events), (*self._mapper.take_changes(), self._mapper.current_poses())
+            )
         )
         self._answer(MapperReport(self._mapper.report()))
 
@@ -133,12 +135,12 @@ class _MapperProcess:
             self._add_keyframes()
             self._send_to_solver()
             self._publish()
-            step = self._guarded("place", self._mapper.next_lookup, None)
+            step = self._guarded("lookup", self._mapper.next_lookup, None)
             if self._is_restoring:  # the mapper has read all restored views by now
                 self._is_restoring = False
                 self._answer(MapRestored())
             if step is not None:
-                self._findings += self._mapper.finish_step(step, *_run_timed(step.run))
+                self._map_events += self._mapper.finish_step(step, *_run_timed(step.run))
 
     def _receive(self, wait: bool) -> Iterator[Any]:
         """Yield all messages in the inbox; if `wait`, wait up to _REPORT_S for the first."""
@@ -175,7 +177,7 @@ class _MapperProcess:
         """Forget keyframes that are too old: at once after a restart, then every minute."""
         if time.monotonic() >= self._expire_due_s:
             self._expire_due_s = time.monotonic() + _EXPIRE_S
-            self._findings += self._guarded("forget", partial(self._mapper.expire, time.time()), [])
+            self._map_events += self._guarded("forget", partial(self._mapper.expire, time.time()), [])
 
     def _add_keyframes(self) -> None:
         """Add waiting keyframes as far as the queue's time budget allows; at the end all of them."""
@@ -186,7 +188,7 @@ class _MapperProcess:
                 break
             added += 1
             work = partial(self._mapper.add_keyframe, add.key, add.keyframe, add.is_over_rate)
-            self._findings += self._guarded("keyframe", work, [], add.key)
+            self._map_events += self._guarded("keyframe", work, [], add.key)
         if added:
             self._answer(KeyframesAdded(added))
 
@@ -196,12 +198,12 @@ class _MapperProcess:
         try:
             return work()
         except Exception as error:
-            self._findings += self._mapper.report_failure(step, error, agent)
+            self._map_events += self._mapper.report_failure(step, error, agent)
             return default
 
     def _send_to_solver(self) -> None:
         step = self._guarded("solve", self._mapper.next_solve, None)
-        self._findings += self._mapper.take_events()
+        self._map_events += self._mapper.take_events()
         if step is not None:
             self._running_solve, self._solve_start_s = step, time.monotonic()
             self._solver.send(step)
@@ -210,7 +212,7 @@ class _MapperProcess:
         step, self._running_solve = self._running_solve, None
         self._has_new_poses = True
         if step is not None:
-            self._findings += self._mapper.finish_step(step, result, ms)
+            self._map_events += self._mapper.finish_step(step, result, ms)
 
     def _new_solver(self, start_delay_s: float) -> WorkerProcess:
         return WorkerProcess("solver", run_solver, (), self._inbox.put, self._post_solver_died, start_delay_s)
@@ -234,9 +236,9 @@ class _MapperProcess:
             self._has_new_poses, self._poses_due_s = False, time.monotonic() + _SAVE_POSES_S
             changes = (*changes, self._mapper.current_poses())
         emptied = self._mapper.take_empty_runs()
-        if self._findings or changes or emptied:
-            self._answer(MapperResult(tuple(self._findings), changes, emptied))
-            self._findings = []
+        if self._map_events or changes or emptied:
+            self._answer(MapperResult(tuple(self._map_events), changes, emptied))
+            self._map_events = []
         if time.monotonic() >= self._report_due_s:
             self._report_due_s = time.monotonic() + _REPORT_S
             solving_s = 0.0 if self._running_solve is None else time.monotonic() - self._solve_start_s

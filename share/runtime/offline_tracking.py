@@ -21,7 +21,7 @@ from share.runtime.imu_bias_store import ImuBiasStore
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source
 from share.sensors.sequencer import SequencerCounters
-from share.types import Frame, KeyframeCandidate
+from share.types import Frame, OdometryKeyframe
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class OfflineFrame(NamedTuple):
     frame: Frame
     result: TrackResult
     error_cm: float | None
-    candidate: KeyframeCandidate | None
+    candidate: OdometryKeyframe | None
     track_s: float
     total_s: float
     cpu_s: float

@@ -118,8 +118,8 @@ class Plan(EdgeObserver):
                 self._runs.pop(effect.key, None)
 
     def add_result(self, result: MapperResult) -> None:
-        for finding in result.findings:
-            correction, run = finding.correction, self._runs.get(finding.agent or "")
+        for map_event in result.map_events:
+            correction, run = map_event.correction, self._runs.get(map_event.agent or "")
             if correction is not None and run is not None:
                 run.correct(correction.segment_keyframe, correction.map_id, correction.T_map_odom)
 

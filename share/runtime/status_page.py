@@ -178,15 +178,15 @@ const isStale = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 10
 const age = ms => typeof ms !== "number" ? "–"
   : ms < 1000 ? `${fixed(ms, 0)} ms` : `${fixed(ms / 1000, 1)} s`;
 
-const isQuarantined = a => ["set apart", "disputed"].includes(a.consistency?.state);
+const isQuarantined = a => ["quarantined", "disputed"].includes(a.consistency?.state);
 const percent = log => Math.abs(100 * Math.expm1(log)).toFixed(1);
 function describeConsistency(c) {
   if (c.reason || c.state === "unknown") return c.reason;
   if (typeof c.log_scale !== "number") return "";
   const sigma = `± ${fixed(100 * c.sigma, 1)} %`;
-  if (!c.put_right && Math.abs(c.log_scale) < 2 * c.sigma) return `depths agree within ${sigma}`;
+  if (!c.corrected_log_scale && Math.abs(c.log_scale) < 2 * c.sigma) return `depths agree within ${sigma}`;
   const error = `depths ${percent(c.log_scale)} ${sigma} too ${c.log_scale > 0 ? "large" : "small"}`;
-  return c.put_right ? `${error}; corrected by ${percent(c.put_right)} %` : error;
+  return c.corrected_log_scale ? `${error}; corrected by ${percent(c.corrected_log_scale)} %` : error;
 }
 
 let previous = null, rates = {};

@@ -23,7 +23,7 @@ from share.config import BASE_POLICY, ControlConfig
 from share.scheduling.base_delay import BaseDelay
 from share.scheduling.qoe import ACCEPTED_DELAY_MS, QoeParameters, qoe_factors
 from share.scheduling.room_budget import RateGrant
-from share.scheduling.room_controller import MeasuredAir, RoomController
+from share.scheduling.room_controller import AirtimeMeasurement, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -219,7 +219,7 @@ class SharePolicy(Policy):
         trip = self._base_trips.get(agent, BaseDelay()).with_delay(evaluation.rtt_ms, report.now_ns)
         self._base_trips[agent] = trip
         air_ms = max(0.0, evaluation.ack_ms - trip.ms - report.held_ms)
-        air = MeasuredAir(air_ms, report.arrival_ms, report.keyframes, report.poses)
+        air = AirtimeMeasurement(air_ms, report.arrival_ms, report.keyframes, report.poses)
         return self._room.grant(agent, terms, hz, evaluation, air, report.now_ns, report.is_placed)
 
     def rate(

@@ -1,9 +1,10 @@
-"""Shares out short air among agents: rates in small steps, each to whom it gains most QoE for its air.
+"""Allocates scarce airtime to agents: rates in small steps, each to the agent with the largest QoE gain for
+its airtime.
 
-A QoE is a factor of the delay, the same for all rates of an agent, times one of the error, which falls with
-its own rate only (`share.scheduling.qoe`). So what a step gains is looked up in a table made once, times the
-factor of the delay at the present load, and one table serves several waits: what is given out while all are
-free to take a step is the same for each longer wait.
+A QoE is a factor of the delay, the same for all rates of an agent, times a factor of the error, which depends
+on the agent's own rate only (`share.scheduling.qoe`). So the gain of a step is an entry of a table made once,
+times the delay's factor at the present load. One table serves several waits, since what is allocated before
+the first limit is the same for each longer wait.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class AirDemand:
     grows between keyframes, at measured_hz. held_hz: what it has."""
 
     terms: QoeTable
-    air_s: F64
-    usual_air_s: float
+    airtime_s: F64
+    median_airtime_s: float
     message_load: float
     weight: F64
     least_hz: F64
@@ -48,13 +49,13 @@ class AirDemand:
 
     def load(self, hz: F64) -> float:
         """Return the load at these rates, at most MAX_LOAD."""
-        return min(MAX_LOAD, self.message_load + float(hz @ self.air_s))
+        return min(MAX_LOAD, self.message_load + float(hz @ self.airtime_s))
 
 
-def most_load(usual_air_s: float, wait_ms: float) -> float:
+def most_load(median_airtime_s: float, wait_ms: float) -> float:
     """Return the load at which a keyframe waits `wait_ms` for others, T / (1 - load) - T; inf where it never
     waits so long."""
-    load = wait_ms / (1e3 * usual_air_s + wait_ms)
+    load = wait_ms / (1e3 * median_airtime_s + wait_ms)
     return load if load < MAX_LOAD else math.inf
 
 
@@ -68,7 +69,7 @@ def allocate_rates(demand: AirDemand, waits_ms: Sequence[float]) -> list[F64]:
     table = _GainTable(demand)
     shared, allocated = _Allocation.least(table), list[F64]()
     for wait_ms in waits_ms:
-        limit = most_load(demand.usual_air_s, wait_ms)
+        limit = most_load(demand.median_airtime_s, wait_ms)
         for group in table.groups:
             if not shared.fill(group, limit, only_while_all_fit=True):
                 break
@@ -88,7 +89,7 @@ class _GainTable:
     served."""
 
     def __init__(self, demand: AirDemand) -> None:
-        self.demand, self.step_load = demand, STEP_HZ * demand.air_s
+        self.demand, self.step_load = demand, STEP_HZ * demand.airtime_s
         self.rates_hz = _rates_above(demand.least_hz, demand.wanted_hz)
         growth = demand.measured_hz[:, None] / np.maximum(self.rates_hz, 1e-3) - 1  # a random walk
         error_cm = np.sqrt(demand.error_cm[:, None] ** 2 + demand.drift_cm[:, None] ** 2 * growth)
@@ -98,7 +99,7 @@ class _GainTable:
         self.worth[:, :-1] = np.where(
             steps_hz <= demand.wanted_hz[:, None],
             np.diff(self.error_factor)
-            / np.maximum(demand.air_s, _LEAST_AIR_S)[:, None]
+            / np.maximum(demand.airtime_s, _LEAST_AIR_S)[:, None]
             * np.where(steps_hz <= demand.held_hz[:, None], _HELD, 1.0),
             _GIVEN,
         )
@@ -124,11 +125,14 @@ class _Group:
         self.step_load = table.step_load[of_form]
         self.largest_step = float(self.step_load.max())
         self._terms = demand.terms.take(self.members)
-        self._other_delay_ms, self._air_ms = demand.other_delay_ms[of_form], 1e3 * demand.air_s[of_form]
+        self._other_delay_ms, self._airtime_ms = (
+            demand.other_delay_ms[of_form],
+            1e3 * demand.airtime_s[of_form],
+        )
 
     def delay_factor(self, load: float) -> F64:
         """Return the factor of the QoE due to delay of each member, at a load of the air."""
-        return self._terms.delay_factor(self._other_delay_ms + self._air_ms / (1 - load))
+        return self._terms.delay_factor(self._other_delay_ms + self._airtime_ms / (1 - load))
 
 
 class _Allocation:

@@ -6,15 +6,15 @@ measured, A, the time that keyframes take, and what arrives a second: L keyframe
 c + k T each. The load is L T + M (c + k T), so T = A (1 - M c) / (1 + A (L + k M)). It does not depend on the
 load, so rates that follow from it do not swing.
 
-A is an agent's own word. How agents compare is what the edge sees, D, the time from the message before a
-keyframe until that has arrived: D + 4 ms, since one transmission arrives at once. By how much A is longer
-than that is one figure for the room, and of an agent's other delay at least what is usual counts. So nobody
-gains over others by what it says of its air or speed (docs/understand/scheduling.md).
+A is reported by the agents. The edge itself observes D, the time from the message before a keyframe until
+the keyframe has arrived; one transmission arrives at once, so D + 4 ms is compared with A. The budget uses
+D + 4 ms of each agent, scaled by the room's median ratio of A to it, and at least the median of the other
+delay. So an agent that reports wrong times gains nothing over others (docs/understand/scheduling.md).
 
-Where keyframes at the rates that all want would wait for each other for more than `FREE_WAIT_MS`, every agent
-begins with its least rate. What is left goes in small steps to whom a step gains most for its air, as long
-as they wait for less; then only where a step gains a headset more QoE than the delay that it causes costs
-all. What a keyframe takes alone on slow air, no rate changes, so it does not count.
+Where keyframes at all wanted rates would wait for each other for more than `FREE_WAIT_MS`, every agent begins
+with its least rate. The rest is allocated in small steps, each to the agent with the largest QoE gain for its
+airtime, while the wait stays below that; beyond it only where a step gains a headset more QoE than the delay
+it adds costs all. What a keyframe takes alone on slow air does not depend on the rates, so it does not count.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
 
 @dataclass(frozen=True)
-class AgentAir:
-    """What the room knows of one agent. wanted_hz: rate by its own QoE. keyframe_s: A, as it says.
-    arrival_s: from the message before a keyframe until that has arrived, as the edge sees it. delay_ms,
+class AgentDemand:
+    """One agent's demand. wanted_hz: rate by its own QoE. keyframe_s: A, as it reports it. arrival_s: D, from
+    the message before a keyframe until the keyframe has arrived, as the edge observes it. delay_ms,
     error_cm: as in `qoe`. drift_cm: part of the error that grows between keyframes. hz: rate of its
     keyframes, pose_hz: of poses. Times and rates are filtered. is_placed: it shares a map with somebody, or
     nobody is there."""
@@ -74,14 +74,14 @@ class AgentAir:
     is_placed: bool = True
 
     @property
-    def seen_s(self) -> float:
-        """How long its keyframes take, as the edge sees it: what precedes one arrives with its beginning."""
+    def observed_s(self) -> float:
+        """Time that its keyframes take as observed, s: the message before one arrives with its beginning."""
         return self.arrival_s + _AT_ONCE_S
 
     @property
-    def claimed_part(self) -> float:
-        """A by what is seen: no keyframe is acknowledged before it has arrived."""
-        return max(self.keyframe_s, self.arrival_s) / self.seen_s
+    def claim_ratio(self) -> float:
+        """Ratio of the reported to the observed time; no keyframe is acknowledged before it has arrived."""
+        return max(self.keyframe_s, self.arrival_s) / self.observed_s
 
     @property
     def messages_hz(self) -> float:
@@ -106,9 +106,9 @@ class RateGrant:
 class RoomBudget:
     """State of the room: agents by name. Immutable: `with_report` returns the next one."""
 
-    agents: Mapping[str, AgentAir] = field(default_factory=dict)
+    agents: Mapping[str, AgentDemand] = field(default_factory=dict)
 
-    def with_report(self, name: str, reported: AgentAir, before: AgentAir | None = None) -> RoomBudget:
+    def with_report(self, name: str, reported: AgentDemand, before: AgentDemand | None = None) -> RoomBudget:
         """Return the budget after an agent's report, whose times and rates are filtered here. Agents
         that are silent are dropped. before: what was known of this one before it fell silent."""
         now_ns, before = reported.updated_ns, self.agents.get(name, before)
@@ -132,20 +132,20 @@ class RoomBudget:
         """Return the budget of a room that an agent has left."""
         return RoomBudget({n: a for n, a in self.agents.items() if n != name})
 
-    def air_s(self, agent: AgentAir) -> float:
-        """Return T of an agent, s: what the edge sees of it, by as much longer as agents say that keyframes
-        take. So what one says of itself is no gain to it over others."""
-        taken_s = self._taken_s(agent)
-        return taken_s * self._idle / (1 + taken_s * self._keyframes_hz)
+    def airtime_s(self, agent: AgentDemand) -> float:
+        """Return T of an agent, s: the observed time, scaled by the room's median ratio of reported to
+        observed time, at an idle channel."""
+        keyframe_time_s = self._keyframe_time_s(agent)
+        return keyframe_time_s * self._idle / (1 + keyframe_time_s * self._keyframes_hz)
 
-    def _taken_s(self, agent: AgentAir) -> float:
-        """Return A of an agent, s, as it counts."""
-        return self._usual_part * agent.seen_s
+    def _keyframe_time_s(self, agent: AgentDemand) -> float:
+        """Return the scaled A of an agent, s."""
+        return self._median_claim_ratio * agent.observed_s
 
     @property
     def load(self) -> float:
         """Part of the air in use, at most MAX_LOAD."""
-        usual_s = self.usual_air_s or 0.0
+        usual_s = self.median_airtime_s or 0.0
         return min(MAX_LOAD, 1 - self._idle + usual_s * self._keyframes_hz)
 
     @cached_property
@@ -159,36 +159,36 @@ class RoomBudget:
         return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
     @cached_property
-    def _usual_part(self) -> float:
-        """A by what is seen, as is usual in the room, of those whose keyframes do not arrive at once."""
+    def _median_claim_ratio(self) -> float:
+        """Median of `claim_ratio`, of agents whose keyframes take longer than one transmission."""
         agents = self.agents.values()
         telling = [agent for agent in agents if agent.arrival_s >= _AT_ONCE_S] or agents
-        return _usual([agent.claimed_part for agent in telling]) or 0.0
+        return _low_median([agent.claim_ratio for agent in telling]) or 0.0
 
     @cached_property
-    def usual_air_s(self) -> float | None:
-        """T, s, as is usual in the room; None without an agent."""
-        return _usual([self.air_s(agent) for agent in self.agents.values()])
+    def median_airtime_s(self) -> float | None:
+        """Median of T, s; None without an agent."""
+        return _low_median([self.airtime_s(agent) for agent in self.agents.values()])
 
     def other_delays_ms(self) -> F64:
-        """Return the part of each agent's delay (N,) that is not the air's, at least what is usual of its
-        form, of two the longer: nobody is served before others because it says that it is fast."""
+        """Return the part of each agent's delay (N,) that is not airtime, at least the median of its form, of
+        two the longer: an agent that reports a short delay is not served first for it."""
         agents = list(self.agents.values())
-        other_ms = [max(0.0, agent.delay_ms - 1e3 * self._taken_s(agent)) for agent in agents]
-        usual_ms = dict[AgentKind, float]()
+        other_ms = [max(0.0, agent.delay_ms - 1e3 * self._keyframe_time_s(agent)) for agent in agents]
+        median_ms = dict[AgentKind, float]()
         for form in {agent.terms.form for agent in agents}:
             of_form = [ms for agent, ms in zip(agents, other_ms, strict=True) if agent.terms.form is form]
-            usual_ms[form] = median(of_form) if len(of_form) > 2 else max(of_form)
-        least_ms = [min(_MOST_OTHER_DELAY_MS, usual_ms[agent.terms.form]) for agent in agents]
+            median_ms[form] = median(of_form) if len(of_form) > 2 else max(of_form)
+        least_ms = [min(_MOST_OTHER_DELAY_MS, median_ms[agent.terms.form]) for agent in agents]
         return np.maximum(other_ms, least_ms)
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
         """Whether not everyone can send what it wants with a wait of less than `wait_ms` for others."""
         messages_hz, load = FULL_POSE_HZ + OTHER_HZ, 0.0
         for agent in self.agents.values():
-            air_s = self.air_s(agent)
-            load += agent.wanted_hz * air_s + messages_hz * message_s(air_s)
-        return load > most_load(self.usual_air_s or 0.0, wait_ms)
+            airtime_s = self.airtime_s(agent)
+            load += agent.wanted_hz * airtime_s + messages_hz * message_s(airtime_s)
+        return load > most_load(self.median_airtime_s or 0.0, wait_ms)
 
     def allocate(
         self, waits_ms: Sequence[float] = (FREE_WAIT_MS,), before: Mapping[str, RateGrant] | None = None
@@ -206,14 +206,14 @@ class RoomBudget:
         """Return what all want where poses are thinned, in the order of `agents`."""
         agents = list(self.agents.values())
         forms = [agent.terms.form for agent in agents]
-        air_s = np.array([self.air_s(agent) for agent in agents])
+        airtime_s = np.array([self.airtime_s(agent) for agent in agents])
         pose_hz = np.array([SCARCE_POSE_HZ[form] for form in forms])
         error_cm = np.array([math.nan if a.error_cm is None else a.error_cm for a in agents])
         return AirDemand(
             terms=QoeTable.of([agent.terms for agent in agents]),
-            air_s=air_s,
-            usual_air_s=self.usual_air_s or 0.0,
-            message_load=float((pose_hz + OTHER_HZ) @ message_s(air_s)),
+            airtime_s=airtime_s,
+            median_airtime_s=self.median_airtime_s or 0.0,
+            message_load=float((pose_hz + OTHER_HZ) @ message_s(airtime_s)),
             weight=np.array([_WEIGHT[form] for form in forms]),
             least_hz=np.array([agent.least_hz for agent in agents]),
             wanted_hz=np.array([agent.wanted_hz for agent in agents]),
@@ -225,8 +225,8 @@ class RoomBudget:
         )
 
 
-def _usual(values: Sequence[float]) -> float | None:
-    """Return the median, which no single agent decides, of two the lesser; None of none."""
+def _low_median(values: Sequence[float]) -> float | None:
+    """Return the median, of two the lesser, so that no single agent decides it; None of none."""
     return None if not values else median(values) if len(values) > 2 else min(values)
 
 

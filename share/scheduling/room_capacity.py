@@ -76,9 +76,9 @@ def crowded_air_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[s
     if len(budget.agents) < _MIN_REPORTS:
         return 0.0
     staying = [agent.terms.form for name, agent in budget.agents.items() if name not in leaving]
-    air_s = _lower_quartile(map(budget.air_s, budget.agents.values()))
-    load = sum(least_load(form, air_s) for form in [joining, *staying])
-    return math.inf if load >= MAX_LOAD else 1e3 * air_s / (1 - load)
+    airtime_s = _lower_quartile(map(budget.airtime_s, budget.agents.values()))
+    load = sum(least_load(form, airtime_s) for form in [joining, *staying])
+    return math.inf if load >= MAX_LOAD else 1e3 * airtime_s / (1 - load)
 
 
 def _lower_quartile(values: Iterable[float]) -> float:

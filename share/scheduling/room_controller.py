@@ -9,7 +9,7 @@ from share.scheduling.rate_allocation import STEP_HZ
 from share.scheduling.room_budget import (
     FREE_WAIT_MS,
     SILENT_S,
-    AgentAir,
+    AgentDemand,
     RateGrant,
     RoomBudget,
     first_grant,
@@ -51,7 +51,7 @@ _PLENTY = 0.75  # of the free wait: less, and the air is no longer short
 
 
 @dataclass(frozen=True)
-class MeasuredAir:
+class AirtimeMeasurement:
     """What is measured of an agent's air. keyframe_ms: A, as it reports. arrival_ms: from the message before
     its newest keyframe until that had arrived, by the edge's clock. keyframes, poses: that have arrived so
     far."""
@@ -68,7 +68,7 @@ class RoomController:
     def __init__(self) -> None:
         self._budget = RoomBudget()
         self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
-        self._last: dict[str, AgentAir] = {}  # newest report of each, of the silent too
+        self._last: dict[str, AgentDemand] = {}  # newest report of each, of the silent too
         self._grants: dict[str, RateGrant] = {}
         self._allocated_ns, self._is_short = 0, False
         self._cut: dict[str, tuple[float, int]] = {}  # rates that were cut, and since when they may rise
@@ -89,7 +89,7 @@ class RoomController:
     @property
     def _keyframe_s(self) -> float:
         """How long a keyframe of an agent that begins takes beside what others send, s."""
-        return (self._budget.usual_air_s or UNKNOWN_KEYFRAME_S) / (1 - self._budget.load)
+        return (self._budget.median_airtime_s or UNKNOWN_KEYFRAME_S) / (1 - self._budget.load)
 
     def grant(
         self,
@@ -97,13 +97,13 @@ class RoomController:
         terms: QoeParameters,
         wanted_hz: float,
         evaluation: Evaluation,
-        air: MeasuredAir,
+        air: AirtimeMeasurement,
         now_ns: int,
         is_placed: bool = True,
     ) -> RateGrant:
-        """Return what an agent may send, by its evaluation. is_placed: see `AgentAir`."""
+        """Return what an agent may send, by its evaluation. is_placed: see `AgentDemand`."""
         hz, pose_hz = self._rates(name, (air.keyframes, air.poses), now_ns)
-        reported = AgentAir(
+        reported = AgentDemand(
             terms=terms,
             wanted_hz=wanted_hz,
             keyframe_s=air.keyframe_ms / 1e3,
@@ -129,9 +129,8 @@ class RoomController:
         return self._limit_rise(name, self._grants[name], now_ns)
 
     def _allocate(self, now_ns: int) -> None:
-        """Allot the air anew. What it takes a little more or less changes nothing: once the air is short it
-        counts as such until there is plenty, and a rate stands as long as it is not too much and there is no
-        plenty for more."""
+        """Allocate the airtime anew, with hysteresis: once scarce, the air counts as scarce until keyframes
+        wait for less than `_PLENTY` of the limit; a rate stays while it is between what both waits allow."""
         self._allocated_ns, plenty_ms = now_ns, _PLENTY * FREE_WAIT_MS
         self._is_short = self._budget.is_short(plenty_ms if self._is_short else FREE_WAIT_MS)
         if not self._is_short:
@@ -145,7 +144,7 @@ class RoomController:
         }
 
     def _limit_rise(self, name: str, grant: RateGrant, now_ns: int) -> RateGrant:
-        """Return the grant, of which a rate that was cut rises slowly: others rise as well."""
+        """Return the grant with a rate that rises slowly after a cut, since others rise as well."""
         if self._is_short and name not in self._cut:
             self._cut[name] = grant.hz, now_ns
         if (cut := self._cut.get(name)) is None:

@@ -178,8 +178,8 @@ class ViewFeed:
                 for change in entry.changes:
                     if (shown := sources.change_event(change)) is not None:
                         yield shown
-                for finding in entry.findings:
-                    if (correction := sources.correction_event(finding)) is not None:
+                for map_event in entry.map_events:
+                    if (correction := sources.correction_event(map_event)) is not None:
                         yield correction
             case _ if isinstance(entry, ev.RoomEvent):
                 yield entry

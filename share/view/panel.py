@@ -11,7 +11,7 @@ from share.colours import Colour
 from share.protocol.agent_health import LIMITS
 from share.types import AgentKind
 from share.view import events as ev
-from share.view.room import LastCorrection, Room
+from share.view.room import DrawnRoom, LastCorrection
 
 _MOST_LIMITS = 5.0  # height of a sparkline, in limits; what is later touches its top
 _MAX_SPARKLINE_POSES = 150  # poses in a sparkline: ten seconds at 15 Hz
@@ -58,7 +58,7 @@ class SidePanel:
             case ev.AgentsReported():
                 self._report = event
 
-    def html(self, room: Room, now_s: float) -> str:
+    def html(self, room: DrawnRoom, now_s: float) -> str:
         """Return the panel as it is now."""
         parts = [f'<div style="color:{_BAD}">{escape(line)}</div>' for line in self._report.trouble]
         if self._report.left_out:

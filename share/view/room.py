@@ -40,7 +40,7 @@ class LastCorrection:
     moved_m: float
 
 
-class Room:
+class DrawnRoom:
     """All runs, their keyframes and loops. Times are the viewer's, s."""
 
     def __init__(self) -> None:

@@ -70,11 +70,11 @@ def change_event(change: MapChange) -> ev.RoomEvent | None:
     return None
 
 
-def correction_event(finding: MapEvent) -> ev.CorrectionArrived | None:
-    if finding.agent is None or (correction := finding.correction) is None:
+def correction_event(map_event: MapEvent) -> ev.CorrectionArrived | None:
+    if map_event.agent is None or (correction := map_event.correction) is None:
         return None
     return ev.CorrectionArrived(
-        finding.agent, correction.map_id, correction.T_map_odom, correction.segment_keyframe
+        map_event.agent, correction.map_id, correction.T_map_odom, correction.segment_keyframe
     )
 
 

@@ -10,7 +10,7 @@ from share.geometry.camera import Rig
 from share.geometry.se3 import inverse
 from share.mapping.loops import KeyframeKey
 from share.odometry.track_result import TrackResult
-from share.types import AgentKind, KeyframeCandidate
+from share.types import AgentKind, OdometryKeyframe
 from share.view import events as ev
 from share.view import sources
 from share.view.feed import ViewFeed
@@ -25,12 +25,12 @@ class TrackedAgent:
     def __init__(self, feed: ViewFeed, name: str, rig: Rig) -> None:
         self._feed, self._run, self._rig = feed, name, rig
         self._segment, self._keyframes = -1, 0
-        self._newest: KeyframeCandidate | None = None
+        self._newest: OdometryKeyframe | None = None
         self._last_pose_s, self._last_report_s = -_POSES_S, -_REPORT_S
         feed.add_event(sources.run_event(name, name, AgentKind.AR, rig))
 
     def add(
-        self, result: TrackResult, candidate: KeyframeCandidate | None, track_ms: float, now_s: float
+        self, result: TrackResult, candidate: OdometryKeyframe | None, track_ms: float, now_s: float
     ) -> None:
         """Add a frame. track_ms: until its pose was there. now_s: monotonic."""
         if result.new_segment:
@@ -58,7 +58,7 @@ class TrackedAgent:
             "pose_ms": track_ms,
         }
 
-    def _add_keyframe(self, candidate: KeyframeCandidate) -> None:
+    def _add_keyframe(self, candidate: OdometryKeyframe) -> None:
         begins, self._newest = self._newest is None, candidate
         points = sources.points_in_body(candidate.view, candidate.image, self._rig)
         key, jpeg = KeyframeKey(self._run, self._keyframes), candidate.image.jpeg.tobytes()

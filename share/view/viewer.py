@@ -210,10 +210,10 @@ class Viewer:
 
     def __init__(self, connection: Connection, window: Any) -> None:
         from share.view.panel import SidePanel
-        from share.view.room import Room
+        from share.view.room import DrawnRoom
 
         self._connection, self._window = connection, window
-        self._room, self._panel = Room(), SidePanel()
+        self._room, self._panel = DrawnRoom(), SidePanel()
         self._panel_due_s = 0.0
         self._heartbeat = PeriodicTimer(_LOOK_S)
         self._is_ended = False

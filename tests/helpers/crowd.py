@@ -1,4 +1,4 @@
-"""Cheap agents for an edge that is a real process: `Agent`, link, and keyframes from a room of points."""
+"""Cheap agents for an edge that is a real process: `AgentProtocol`, link, keyframes of a room of points."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from share.config import Config
 from share.geometry import se3
 from share.net.transport import AgentLink, connect
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
-from share.types import F64, KeyframeCandidate, TrackState, View
+from share.types import F64, OdometryKeyframe, TrackState, View
 from share.wire.messages import Hello
 
 FRAME_S = 0.1
@@ -56,7 +56,7 @@ class Walker(threading.Thread):
 
     def __init__(self, hello: Hello, script: Script, address: str) -> None:
         super().__init__(name=hello.name, daemon=True)
-        self.script, self.machine = script, Agent(hello, Config())
+        self.script, self.machine = script, AgentProtocol(hello, Config())
         self._T_last = np.eye(4)  # of the last candidate
         self.lives: list[Life] = []
         self.maps: list[tuple[float, str]] = []
@@ -106,7 +106,7 @@ class Walker(threading.Thread):
         if view is not None:
             T_last_body = se3.inverse(self._T_last) @ T
             self._T_last = T
-            candidate = KeyframeCandidate(T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, k == 0)
+            candidate = OdometryKeyframe(T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, k == 0)
             self._handle(link, ev.KeyframeMade(frame, candidate))
 
     def _handle(self, link: AgentLink, event: ev.AgentEvent) -> None:

@@ -19,10 +19,10 @@ from share.mapping.mapper import Mapper
 from share.mapping.steps import SolveStep, Step
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, SendToEdge, Tick
-from share.protocol.edge import Edge
-from share.types import F64, U8, AgentKind, Keyframe, KeyframeCandidate, TrackState, View
+from share.protocol.edge import EdgeProtocol
+from share.types import F64, U8, AgentKind, Keyframe, OdometryKeyframe, TrackState, View
 from share.wire.codec import decode
 from share.wire.messages import Hello, peer_id
 
@@ -126,7 +126,7 @@ class ModelRun:
     """One life of the edge: both machines, as `share.runtime.edge` has them, without processes."""
 
     def __init__(self, config: Config, session: int) -> None:
-        self.machine = Edge(config, session)
+        self.machine = EdgeProtocol(config, session)
         self.mapper = Mapper(config)
         self.solver = PoseGraphSolver()
 
@@ -148,7 +148,7 @@ class Town:
         self.config = config or Config(edge=EdgeConfig(policy="covins-g"))  # everything is sent and merged
         self.weather = weather or Weather(0)
         self.people: dict[bytes, Person] = {}
-        self.agents: dict[bytes, Agent] = {}
+        self.agents: dict[bytes, AgentProtocol] = {}
         self.agent_effects: dict[bytes, list[ev.AgentEffect]] = {}
         for person in people:
             self.arrive(person)
@@ -160,7 +160,7 @@ class Town:
 
     def arrive(self, person: Person) -> None:
         peer = peer_id(person.run_id)
-        self.people[peer], self.agents[peer] = person, Agent(person.hello, self.config)
+        self.people[peer], self.agents[peer] = person, AgentProtocol(person.hello, self.config)
         self.agent_effects[peer] = []
 
     def vanish(self, name: str) -> None:
@@ -223,12 +223,12 @@ class Town:
                 case ed.WriteEvent(fields):
                     self.records.append(fields)
 
-    def _mapped(self, edge: ModelRun, findings: list[MapEvent]) -> None:
+    def _mapped(self, edge: ModelRun, map_events: list[MapEvent]) -> None:
         """The mapper has decided something, and goes on to its next steps, each in its own time."""
         if self.edge is not edge:
             return
         if found := ed.MapperResult(
-            tuple(findings), edge.mapper.take_changes(), edge.mapper.take_empty_runs()
+            tuple(map_events), edge.mapper.take_changes(), edge.mapper.take_empty_runs()
         ):
             self._in(0, lambda: self.to_edge(found) if self.edge is edge else None)
         for step in (edge.mapper.next_lookup(), edge.mapper.next_solve()):
@@ -277,7 +277,7 @@ class Town:
         tracked = ev.FrameTracked(k, person.stamp_ns(at), at, at + 4 * MS, TrackState.OK, T, True, k == 0)
         self.to_agent(peer, tracked)
         T_last_body = T if k == 0 else se3.inverse(person.T_odom_body[-2]) @ T
-        candidate = KeyframeCandidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, k == 0)
+        candidate = OdometryKeyframe(T, T_last_body, person.cov, np.zeros(3), 0.0, view, k == 0)
         self.to_agent(peer, ev.KeyframeMade(tracked, candidate))
 
     def _in(self, ns: int, act: Callable[[], None]) -> None:

@@ -12,10 +12,10 @@ from helpers.hellos import hello_of
 
 from share.geometry import se3
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, SendToEdge
 from share.protocol.keyframe_intake import ReorderBuffer
-from share.types import Correction, Keyframe, KeyframeCandidate, TrackState, View
+from share.types import Correction, Keyframe, OdometryKeyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -36,10 +36,12 @@ def tracked(
     return ev.FrameTracked(k, 10**15 + at, at, at + round(ms * MS), TrackState.OK, T, candidate, new_stretch)
 
 
-_T_LAST: WeakKeyDictionary[Agent, np.ndarray] = WeakKeyDictionary()  # of its last candidate
+_T_LAST: WeakKeyDictionary[AgentProtocol, np.ndarray] = WeakKeyDictionary()  # of its last candidate
 
 
-def handle(agent: Agent, event: ev.AgentEvent, now_ns: int, view: View = EMPTY) -> list[ev.AgentEffect]:
+def handle(
+    agent: AgentProtocol, event: ev.AgentEvent, now_ns: int, view: View = EMPTY
+) -> list[ev.AgentEffect]:
     """Gives the agent the event, and after a keyframe's pose the keyframe, as a tracker does."""
     effects = agent.handle(event, now_ns)
     if isinstance(event, ev.FrameTracked) and event.is_keyframe:
@@ -47,7 +49,7 @@ def handle(agent: Agent, event: ev.AgentEvent, now_ns: int, view: View = EMPTY) 
         T = event.T_odom_body
         T_last_body = se3.inverse(_T_LAST.get(agent, np.eye(4))) @ T
         _T_LAST[agent] = T
-        candidate = KeyframeCandidate(T, T_last_body, COV, UP, 0.01, view, event.new_segment)
+        candidate = OdometryKeyframe(T, T_last_body, COV, UP, 0.01, view, event.new_segment)
         effects = effects + agent.handle(ev.KeyframeMade(event, candidate), now_ns)
     return effects
 
@@ -116,7 +118,7 @@ class Network:
 class World:
     """One agent, perhaps an edge, and the network between them."""
 
-    def __init__(self, agent: Agent, edge: ModelEdge | None, network: Callable[[], Network]) -> None:
+    def __init__(self, agent: AgentProtocol, edge: ModelEdge | None, network: Callable[[], Network]) -> None:
         self.agent, self.edge = agent, edge
         self.up, self.down = network(), network()
         self.effects: list[ev.AgentEffect] = []

@@ -7,7 +7,7 @@ import numpy as np
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
 from share.scheduling.room_budget import OTHER_HZ, first_grant, message_s
-from share.scheduling.room_controller import MeasuredAir, RoomController
+from share.scheduling.room_controller import AirtimeMeasurement, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -73,7 +73,13 @@ class Air:
             told = Evaluation(0, 60 + air_ms, 1.2, 10.0, 5.0, 5 + air_ms, 0.5)
             counts = round(self.counts[k][0]), round(self.counts[k][1])
             seen_ms = max(0.0, keyframe_ms * self._noisy() - AT_ONCE_MS)
-            at = f"a{k}", TERMS[kind], self.wanted_hz[kind], told, MeasuredAir(air_ms, seen_ms, *counts)
+            at = (
+                f"a{k}",
+                TERMS[kind],
+                self.wanted_hz[kind],
+                told,
+                AirtimeMeasurement(air_ms, seen_ms, *counts),
+            )
             self.grants[k] = self.room.grant(*at, round(self.now_s * S))
 
     def _noisy(self) -> float:

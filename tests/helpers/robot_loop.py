@@ -24,7 +24,7 @@ from share.lab.robot.planner import RoomGrid
 from share.lab.robot.simulate import usual_robot
 from share.robot.planar import PlanarPose
 from share.robot.settings import RobotSettings
-from share.types import F64, AgentKind, KeyframeCandidate, TrackState
+from share.types import F64, AgentKind, OdometryKeyframe, TrackState
 
 SIZE = np.array([8.0, 6.0])
 STEP_M = 0.1
@@ -82,9 +82,7 @@ class SeeingAgent:
         before = self._T_before
         T_last_body = T if before is None else se3.inverse(before) @ T
         view = look(WALLS, T_world_body, self._rng)
-        candidate = KeyframeCandidate(
-            T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, before is None
-        )
+        candidate = OdometryKeyframe(T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, before is None)
         self._T_before = T
         return TrackedFrame(now_ns, T, 0.5, candidate, cov=1e-6 * np.eye(6), new_segment=before is None)
 

@@ -15,7 +15,7 @@ from share.mapping.map_changes import SaveObject, SavePoses
 from share.protocol import edge_events as ed
 from share.protocol import room_events as ev
 from share.protocol.common_events import Connected, EdgeMessageReceived, SendToEdge, Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.room_client import RoomClient
 from share.types import F64, Correction
 from share.wire import room_messages as room
@@ -66,7 +66,7 @@ class RoomBench:
     # ------------------------------------------------------------ the edge
 
     def start_edge(self, objects: list[SaveObject] | None = None) -> None:
-        self.edge = Edge(Config(), self.session, self.has_store, objects=objects or ())
+        self.edge = EdgeProtocol(Config(), self.session, self.has_store, objects=objects or ())
         self.run_of: dict[str, bytes] = {}
 
     def restart_edge(self) -> None:

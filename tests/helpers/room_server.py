@@ -14,7 +14,7 @@ from share.mapping.corrections import MapEvent
 from share.net.transport import bind
 from share.protocol import edge_events as ed
 from share.protocol.common_events import Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.timing import PeriodicTimer
 from share.types import Correction
 from share.wire.codec import encode
@@ -28,7 +28,7 @@ class RoomServer:
     def __init__(self, allowed: Collection[Permission] = tuple(Permission)) -> None:
         self.link, self._allowed, self._is_ended = bind("tcp://127.0.0.1:0"), frozenset(allowed), False
         self.address, self.events = self.link.endpoint, list[dict[str, object]]()
-        self.edge = Edge(Config(), 7)
+        self.edge = EdgeProtocol(Config(), 7)
         self._handle(ed.PeerMessageReceived(peer_id(1), encode(hello_of("ann", 1))))
         (run,) = self.edge.room._runs.present()
         correction = Correction(np.eye(4), np.zeros((6, 6)), MAP, 0, 0)

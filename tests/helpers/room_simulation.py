@@ -9,7 +9,7 @@ from helpers.edge_sim import Person
 
 from share.geometry import se3
 from share.lab.evaluate.simulation import TrackedFrame
-from share.types import KeyframeCandidate
+from share.types import OdometryKeyframe
 
 MS = 1_000_000
 
@@ -23,6 +23,6 @@ def tracked_frames(person: Person, seconds: float) -> Iterator[TrackedFrame]:
             continue
         T, view = person.step()
         T_last_body = T if T_before is None else se3.inverse(T_before) @ T
-        candidate = KeyframeCandidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, T_before is None)
+        candidate = OdometryKeyframe(T, T_last_body, person.cov, np.zeros(3), 0.0, view, T_before is None)
         T_before = T
         yield TrackedFrame(50 * k * MS, T, 0.5, candidate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from share.scheduling.qoe import qoe
-from share.scheduling.room_budget import OTHER_HZ, SCARCE_POSE_HZ, AgentAir, RoomBudget, message_s
+from share.scheduling.room_budget import OTHER_HZ, SCARCE_POSE_HZ, AgentDemand, RoomBudget, message_s
 from share.types import AgentKind
 
 STEP_HZ, LOAD_STEP, MAX_LOAD, HELD = 0.25, 0.01, 0.95, 1.5
@@ -17,7 +17,7 @@ class StepwiseAllocation:
 
     def __init__(self, budget: RoomBudget, held_hz: dict[str, float]) -> None:
         self._budget, self._agents, self._held_hz = budget, budget.agents, held_hz
-        self._air_s = {name: budget.air_s(one) for name, one in budget.agents.items()}
+        self._airtime_s = {name: budget.airtime_s(one) for name, one in budget.agents.items()}
         other_ms = budget.other_delays_ms().tolist()
         self._other_delay_ms = dict(zip(budget.agents, other_ms, strict=True))
         forms = {one.terms.form for one in self._agents.values()}
@@ -27,7 +27,7 @@ class StepwiseAllocation:
         hz = {name: one.least_hz for name, one in self._agents.items()}
         while (load := self._load(hz)) < MAX_LOAD:
             is_open = [n for n, one in self._agents.items() if hz[n] + STEP_HZ <= one.wanted_hz]
-            free = [n for n in is_open if not self._waits(load + STEP_HZ * self._air_s[n], wait_ms)]
+            free = [n for n in is_open if not self._waits(load + STEP_HZ * self._airtime_s[n], wait_ms)]
             gain = {n: self._gain(n, hz[n], load) for n in is_open}
             steps = [n for n in free if self._is_first(n)] or free
             if not steps:
@@ -43,19 +43,19 @@ class StepwiseAllocation:
 
     def _load(self, hz: dict[str, float]) -> float:
         messages = sum(
-            (SCARCE_POSE_HZ[one.terms.form] + OTHER_HZ) * message_s(self._air_s[n])
+            (SCARCE_POSE_HZ[one.terms.form] + OTHER_HZ) * message_s(self._airtime_s[n])
             for n, one in self._agents.items()
         )
-        return min(MAX_LOAD, messages + sum(hz[n] * self._air_s[n] for n in hz))
+        return min(MAX_LOAD, messages + sum(hz[n] * self._airtime_s[n] for n in hz))
 
     def _waits(self, load: float, wait_ms: float) -> bool:
         part = min(MAX_LOAD, load)
-        return 1e3 * (self._budget.usual_air_s or 0.0) * part / (1 - part) > wait_ms
+        return 1e3 * (self._budget.median_airtime_s or 0.0) * part / (1 - part) > wait_ms
 
     def _gain(self, name: str, hz: float, load: float) -> float:
         gain = self._qoe(name, hz + STEP_HZ, load) - self._qoe(name, hz, load)
         held = HELD if hz + STEP_HZ <= self._held_hz.get(name, 0.0) else 1.0
-        return held * gain / max(self._air_s[name], 1e-6)
+        return held * gain / max(self._airtime_s[name], 1e-6)
 
     def _cost(self, hz: dict[str, float], load: float) -> float:
         lost = (self._qoe(n, hz[n], load) - self._qoe(n, hz[n], load + LOAD_STEP) for n in hz)
@@ -64,11 +64,11 @@ class StepwiseAllocation:
     def _qoe(self, name: str, hz: float, load: float) -> float:
         """Return an agent's QoE, weighted, by its rate and the load of the air."""
         one = self._agents[name]
-        delay_ms = self._other_delay_ms[name] + 1e3 * self._air_s[name] / (1 - load)
+        delay_ms = self._other_delay_ms[name] + 1e3 * self._airtime_s[name] / (1 - load)
         return WEIGHT[one.terms.form] * qoe(delay_ms, _error_cm(one, hz), one.terms)
 
 
-def _error_cm(one: AgentAir, hz: float) -> float | None:
+def _error_cm(one: AgentDemand, hz: float) -> float | None:
     if one.error_cm is None:
         return None
     growth = max(one.hz, 1e-3) / max(hz, 1e-3) - 1

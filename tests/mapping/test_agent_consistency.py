@@ -166,7 +166,7 @@ def test_of_three_agents_the_wrong_one_is_quarantined(liar, scale):
     assert agreement.quarantined == {liar}
     assert any(said)
     standing = agreement.standing(liar)
-    assert standing.state == "set apart"
+    assert standing.state == "quarantined"
     assert ("larger" if scale > 1 else "smaller") in standing.reason
     assert standing.log_scale == pytest.approx(np.log(scale), abs=0.015)
     honest = {"ann", "bob", "eve"} - {liar}

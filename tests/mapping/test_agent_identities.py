@@ -75,14 +75,14 @@ def test_loops_of_all_runs_of_a_name_count_as_those_of_one_agent():
         assert town.agreement.separation_reason(["ann-1"], [f"eve-{n}"]) or town.agreement.unverified_reason(
             ["ann-1"], [f"eve-{n}"]
         )
-    assert town.agreement.standing("eve-1").state == "set apart"
+    assert town.agreement.standing("eve-1").state == "quarantined"
     assert not town.agreement.separation_reason(["ann-1"], ["bob-1"])
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
 def test_a_new_run_of_a_quarantined_name_is_compared_before_it_joins(scale):
     town = with_a_wrong_agent()
-    assert town.agreement.standing("eve-1").state == "set apart"
+    assert town.agreement.standing("eve-1").state == "quarantined"
     town.enter("eve-2")
     assert "earlier run" in town.agreement.standing("eve-2").reason
     assert "earlier run" in town.agreement.unverified_reason(["ann-1"], ["eve-2"])
@@ -92,13 +92,13 @@ def test_a_new_run_of_a_quarantined_name_is_compared_before_it_joins(scale):
             town.meet(other, "eve-2", scale)
     standing, honest = town.agreement.standing("eve-2"), town.agreement.standing("bob-1")
     assert honest.state == "agrees"
-    assert town.agreement.standing("eve-1").state == "set apart"
+    assert town.agreement.standing("eve-1").state == "quarantined"
     if scale == 1.0:
         assert standing.state == "agrees"
         assert not town.agreement.unverified_reason(["ann-1"], ["eve-2"])
         assert not town.agreement.separation_reason(["ann-1"], ["eve-2"])
     else:
-        assert standing.state == "set apart"
+        assert standing.state == "quarantined"
         assert town.agreement.separation_reason(["ann-1"], ["eve-2"])
 
 
@@ -106,7 +106,7 @@ def test_of_two_that_disagree_the_one_with_a_quarantined_run_is_quarantined():
     town = with_a_wrong_agent()
     town.enter("eve-2")
     town.meet("bob-1", "eve-2", 1.05, 5)
-    assert town.agreement.standing("eve-2").state == "set apart"
+    assert town.agreement.standing("eve-2").state == "quarantined"
     assert town.agreement.standing("bob-1").state == "agrees"
 
 
@@ -142,7 +142,7 @@ def test_an_agent_that_becomes_wrong_is_detected_by_its_newest_loops():
             town.meet(a, b, 1.0)
     assert town.agreement.standing("eve-1").state == "agrees"
     loops = 0
-    while town.agreement.standing("eve-1").state != "set apart" and loops < 40:
+    while town.agreement.standing("eve-1").state != "quarantined" and loops < 40:
         loops += 1
         for other in ("ann-1", "bob-1"):
             town.meet(other, "eve-1", 1.05)
@@ -174,7 +174,7 @@ def test_loops_of_an_unverified_run_are_not_accepted_before_it_is_compared():
     for a, b, log in ((ann, bob, 0.0), (ann, first, 0.05), (bob, first, 0.05)):
         for loop in near_loops(a, b, rng):
             atlas.quarantine.add_loop(loop, DepthScale(log, 0.005))
-    assert atlas.quarantine.agreement.standing("eve-1").state == "set apart"
+    assert atlas.quarantine.agreement.standing("eve-1").state == "quarantined"
     atlas.add_run("eve-2", "eve")
     for keyframe in second.keyframes:
         atlas.add_keyframe("eve-2", keyframe)
@@ -191,7 +191,7 @@ def test_a_quarantined_agent_does_not_affect_the_scales_of_others():
     town.meet("ann-1", "eve-1", 1.05, 30)
     town.meet("bob-1", "eve-1", 1.0, 10)
     town.meet("bob-1", "eve-1", 1.05, 30)
-    assert town.agreement.standing("eve-1").state == "set apart"
+    assert town.agreement.standing("eve-1").state == "quarantined"
     assert town.agreement.log_scale("ann-1") == town.agreement.log_scale("bob-1") == 0.0
 
 

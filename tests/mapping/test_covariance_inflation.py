@@ -18,7 +18,7 @@ from share.mapping.graph.edges import PoseEdge
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredKeyframe, StoredMap
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
-from share.mapping.recognition.refinement import KeypointNoise, refine_pose
+from share.mapping.recognition.refinement import KeypointNoise, refine_relative_pose
 from share.types import Keyframe, View
 
 NOISE = KeypointNoise(1.5 / 400, 0.01)
@@ -41,7 +41,7 @@ def views(log: float, rng) -> tuple:
 @pytest.mark.parametrize("log", [-0.03, -0.01, 0.01, 0.03])
 def test_the_pose_sensitivity_is_that_of_a_depth_scale(log):
     y_q, y_c = views(log, np.random.default_rng(1))
-    fine = refine_pose(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3)
+    fine = refine_relative_pose(T_C_Q, y_q, y_c, NOISE, NOISE, 11.3)
     found = relative_depth_scale(fine.T, y_q, y_c, NOISE, NOISE, 11.3)
     assert found is not None and found.pose_sensitivity is not None
     right = se3.exp(found.pose_sensitivity * log) @ fine.T
@@ -75,7 +75,7 @@ def test_harmless_scales_are_estimated_relative_to_the_others(scale):
     agreement = compared_agents({"ann": 1.0, "bob": 1.0, "eve": scale})
     assert not agreement.quarantined
     assert agreement.log_scales["eve"] == pytest.approx(np.log(scale), abs=0.0025)
-    assert agreement.standing("eve").put_right == agreement.log_scales["eve"]
+    assert agreement.standing("eve").corrected_log_scale == agreement.log_scales["eve"]
     assert abs(agreement.log_scales.get("ann", 0.0)) < 0.0025 > abs(agreement.log_scales.get("bob", 0.0))
 
 

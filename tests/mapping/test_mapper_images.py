@@ -190,14 +190,14 @@ def test_an_alignment_that_fails_costs_its_candidate_only(place: Planes) -> None
             mapper.add_keyframe(name, sent)
             work(mapper)
     mapper.add_keyframe("bob", run[6][1])
-    done, findings = [], []
+    done, map_events = [], []
     while (step := mapper.next_lookup()) is not None:
         done.append(step)
         is_first = [one.kind for one in done].count("align") == 1 and step.kind == "align"
-        findings += mapper.finish_step(step, RuntimeError("bad") if is_first else step.run(), 1.0)
+        map_events += mapper.finish_step(step, RuntimeError("bad") if is_first else step.run(), 1.0)
     assert [step.kind for step in done].count("align") >= 2
-    failed = [finding for finding in findings if finding.event == "step failed"]
-    assert [finding.agent for finding in failed] == ["bob"]
+    failed = [map_event for map_event in map_events if map_event.event == "step failed"]
+    assert [map_event.agent for map_event in failed] == ["bob"]
     assert "align: RuntimeError: bad" in failed[0].reason
     assert mapper.report()["failed_steps"] == 1
 
@@ -253,7 +253,7 @@ def test_an_image_in_which_no_features_can_be_found_is_tried_once() -> None:
     mapper.add_run("eve", replace(hello_of("eve", 1), rig=rig))
     sent = Keyframe(0, -1, 0, np.eye(4), COV, np.eye(4), UP, 0.0, View.empty(), -1, image)
     mapper.add_keyframe("eve", sent)
-    findings = []
+    map_events = []
     for _ in range(20):
         if (step := mapper.next_lookup()) is None:
             break
@@ -261,10 +261,10 @@ def test_an_image_in_which_no_features_can_be_found_is_tried_once() -> None:
             result = step.run()
         except Exception as error:
             result = error
-        findings += mapper.finish_step(step, result, 1.0)
+        map_events += mapper.finish_step(step, result, 1.0)
     else:
         pytest.fail("it is tried for ever")
-    assert [finding.event for finding in findings].count("step failed") == 1
+    assert [map_event.event for map_event in map_events].count("step failed") == 1
     assert mapper.report()["failed_steps"] == 1
 
 
@@ -277,13 +277,13 @@ def test_a_damaged_image_costs_the_keyframe_its_features_only_and_is_said_once(
         broken = keyframe.image.jpeg.copy()
         broken[-900 if k else 2 : -2] = 255 if k else 0
         mapper.add_keyframe("ann", replace(keyframe, image=replace(keyframe.image, jpeg=broken)))
-    done, findings = [], []
+    done, map_events = [], []
     while (step := mapper.next_lookup()) is not None:
         done.append((step, step.run()))
-        findings += mapper.finish_step(step, done[-1][1], 1.0)
+        map_events += mapper.finish_step(step, done[-1][1], 1.0)
     assert [len(view) for step, view in done if isinstance(step, DescribeStep)] == [0, 0]
     assert mapper.report()["failed_steps"] == 0
-    said = [finding.reason for finding in findings if finding.event == "odometry suspect"]
+    said = [map_event.reason for map_event in map_events if map_event.event == "odometry suspect"]
     assert sorted(said) == [f"keyframe {k}: its image is damaged: without it" for k in (0, 1)]
     assert capfd.readouterr().err == ""
     mapper.remove_keyframes([done[0][0].node_id])

@@ -7,7 +7,7 @@ from share.mapping.recognition.refinement import (
     KeypointNoise,
     keypoint_jacobian,
     pose_jacobian,
-    refine_pose,
+    refine_relative_pose,
     transfer_keypoints,
 )
 from share.types import F64
@@ -64,7 +64,7 @@ def test_exact_matches_give_the_exact_pose() -> None:
     T = se3.exp(np.array([0.2, -0.1, 0.15, 0.5, -0.2, 0.3]))
     y_q, y_c = matched(rng, T, 60, noise=0.0)
     start = T @ se3.exp(np.full(6, 0.03))
-    fine = refine_pose(start, y_q, y_c, NOISE, NOISE, 11.3)
+    fine = refine_relative_pose(start, y_q, y_c, NOISE, NOISE, 11.3)
     assert np.abs(se3.log(se3.inverse(T) @ fine.T)).max() < 1e-9
 
 
@@ -73,7 +73,7 @@ def test_a_third_of_wrong_matches_does_not_move_it() -> None:
     T = se3.exp(np.array([0.1, 0.2, -0.1, 0.4, 0.1, 0.2]))
     y_q, y_c = matched(rng, T, 150)
     y_c[50:100] = y_c[rng.permutation(np.arange(50, 100))]
-    fine = refine_pose(T @ se3.exp(np.full(6, 0.01)), y_q, y_c, NOISE, NOISE, 11.3)
+    fine = refine_relative_pose(T @ se3.exp(np.full(6, 0.01)), y_q, y_c, NOISE, NOISE, 11.3)
     xi = se3.log(se3.inverse(T) @ fine.T)
     assert np.linalg.norm(xi[3:]) < 0.03
     assert xi @ np.linalg.solve(fine.cov, xi) < 22.5
@@ -90,7 +90,7 @@ def test_covariance_is_consistent() -> None:
         rng = np.random.default_rng(seed)
         T = se3.exp(rng.normal(0, [0.15] * 3 + [0.3] * 3))
         y_q, y_c = matched(rng, T, 80)
-        fine = refine_pose(T, y_q, y_c, NOISE, NOISE, 11.3)
+        fine = refine_relative_pose(T, y_q, y_c, NOISE, NOISE, 11.3)
         xi = se3.log(se3.inverse(T) @ fine.T)
         nees.append(xi @ np.linalg.solve(fine.cov, xi))
     assert 5.1 < np.mean(nees) < 7.2
@@ -98,5 +98,5 @@ def test_covariance_is_consistent() -> None:
 
 def test_degenerate_matches_have_a_huge_covariance() -> None:
     y = np.tile([0.1, 0.1, 0.5], (10, 1))
-    fine = refine_pose(np.eye(4), y, y, NOISE, NOISE, 11.3)
+    fine = refine_relative_pose(np.eye(4), y, y, NOISE, NOISE, 11.3)
     assert np.linalg.eigvalsh(fine.cov).max() > 1.0

@@ -17,7 +17,7 @@ from share.mapping.map_changes import RemoveKeyframes, RemoveRun
 from share.mapping.mapper import Mapper
 from share.protocol import edge_events as ed
 from share.protocol.common_events import Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.peer import restored_runs
 from share.store.map_store import MapStore
 from share.types import F64, Keyframe, View
@@ -40,7 +40,7 @@ class Session:
     def __init__(self, store: MapStore, session: int = 7) -> None:
         kept = store.load()
         self.store, self.mapper = store, Mapper(CONFIG)
-        self.edge = Edge(CONFIG, session, has_store=True, restored=restored_runs(kept, 0.05))
+        self.edge = EdgeProtocol(CONFIG, session, has_store=True, restored=restored_runs(kept, 0.05))
         if kept.runs:
             self.mapper.restore(kept)
         self.sent: list[m.Message] = []
@@ -318,9 +318,9 @@ def test_a_run_that_returns_without_keyframes_is_sent_a_map_of_its_own(tmp_path:
         atlas.remove_keyframes([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
         mapper.set_present(eve, True)
         own = Keyframe(5, 4, 5 * S, at(1.0), 1e-6 * np.eye(6), at(5), np.zeros(3), 0.0, EMPTY, 4)
-        (finding,) = mapper.add_keyframe(eve, own)
-        assert finding.correction is not None
-        assert (finding.agent, finding.correction.map_id) == (eve, f"{eve}/0")
-        assert np.allclose(finding.correction.T_map_odom, np.eye(4))
+        (map_event,) = mapper.add_keyframe(eve, own)
+        assert map_event.correction is not None
+        assert (map_event.agent, map_event.correction.map_id) == (eve, f"{eve}/0")
+        assert np.allclose(map_event.correction.T_map_odom, np.eye(4))
         step = Keyframe(6, 5, 6 * S, at(1.0), 1e-6 * np.eye(6), at(6), np.zeros(3), 0.0, EMPTY, 5)
         assert mapper.add_keyframe(eve, step) == []

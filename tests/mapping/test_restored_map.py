@@ -73,7 +73,7 @@ def restarted(session: Session, path: Path, config: Config) -> Session:
     second = Session(config)
     second.mapper.restore(kept)
     for run, name in zip(restored_runs(kept, 0.05), ("ann", "bob"), strict=True):
-        published = run.last_finding  # before the mapper has said anything, and the same as it would
+        published = run.last_correction_event  # before the mapper has said anything, and the same as it would
         assert published is not None and published.correction is not None
         correction = published.correction
         assert (published.agent, correction.map_id) == (name, second.mapper.atlas.current_map_id(name))
@@ -171,7 +171,7 @@ def test_a_run_without_keyframes_is_restored(tmp_path: Path) -> None:
         store.write(session.changes)
         kept = store.load()
     Mapper(config).restore(kept)
-    assert [run.last_finding for run in restored_runs(kept, 0.05)] == [None]
+    assert [run.last_correction_event for run in restored_runs(kept, 0.05)] == [None]
 
 
 def test_a_segment_whose_run_was_lost_is_restored() -> None:
@@ -193,7 +193,7 @@ def test_a_merge_whose_poses_were_not_stored_is_not_published_as_before(tmp_path
     with MapStore.open(tmp_path / "room.sqlite") as store:
         kept = store.load()
     assert len(kept.loops) > 0
-    assert [run.last_finding for run in restored_runs(kept, 0.05)] == [None, None]
+    assert [run.last_correction_event for run in restored_runs(kept, 0.05)] == [None, None]
 
 
 def test_runs_whose_keyframes_a_damaged_file_has_lost_are_reported():

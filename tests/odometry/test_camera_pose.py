@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.odometry.relocalisation import ransac_pose, refine_pose, reprojection_residuals
+from share.odometry.relocalisation import ransac_pose, refine_absolute_pose, reprojection_residuals
 
 FOCAL = 400.0
 
@@ -30,7 +30,7 @@ def test_finds_the_pose_among_sixty_percent_outliers(rng):
     T, points, uv = scene(rng, 200, 0.5, outliers=120)
     found = ransac_pose(points, uv, FOCAL, 3.0, seed=0)
     assert found is not None
-    best = refine_pose(found.T, points, uv, FOCAL, np.ones(200), 3.0)
+    best = refine_absolute_pose(found.T, points, uv, FOCAL, np.ones(200), 3.0)
     assert np.linalg.norm(se3.log(se3.inverse(T) @ best.T)) < 0.01
     assert best.inliers[120:].mean() > 0.95
     assert best.inliers[:120].mean() < 0.1
@@ -53,7 +53,9 @@ def test_covariance_is_consistent(rng):
     nees = []
     for _ in range(100):
         T, points, uv = scene(rng, 120, 1.0)
-        best = refine_pose(T @ se3.exp(0.01 * rng.normal(size=6)), points, uv, FOCAL, np.ones(120), 3.0)
+        best = refine_absolute_pose(
+            T @ se3.exp(0.01 * rng.normal(size=6)), points, uv, FOCAL, np.ones(120), 3.0
+        )
         error = se3.log(se3.inverse(T) @ best.T)
         nees.append(error @ np.linalg.solve(best.cov, error))
     assert 5.0 < np.mean(nees) < 7.2
@@ -63,7 +65,7 @@ def test_covariance_is_consistent(rng):
 def test_refine_is_a_minimum(seed):
     rng = np.random.default_rng(seed)
     T, points, uv = scene(rng, 100, 1.0)
-    best = refine_pose(T, points, uv, FOCAL, np.ones(100), 3.0)
+    best = refine_absolute_pose(T, points, uv, FOCAL, np.ones(100), 3.0)
     r, J = reprojection_residuals(best.T, points, uv, FOCAL * np.ones(100))
     w = 1 / (1 + (r * r).sum(axis=1) / 4)
     gradient = np.einsum("nij,n,ni->j", J, w, r)

@@ -7,16 +7,16 @@ import pytest
 
 from share.geometry import se3
 from share.odometry.error_model.history import FrameOutcome, MotionHistory
-from share.types import KeyframeCandidate, TrackState, View
+from share.types import OdometryKeyframe, TrackState, View
 
 S = 1_000_000_000
 NOTHING = View(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
 AHEAD = se3.from_quat(np.array([[2.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))[0]
 
 
-def candidate(T: np.ndarray, sigma_rad: float, sigma_m: float, new: bool = False) -> KeyframeCandidate:
+def candidate(T: np.ndarray, sigma_rad: float, sigma_m: float, new: bool = False) -> OdometryKeyframe:
     cov = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
-    return KeyframeCandidate(np.eye(4), T, cov, np.zeros(3), 0.0, NOTHING, new)
+    return OdometryKeyframe(np.eye(4), T, cov, np.zeros(3), 0.0, NOTHING, new)
 
 
 def outcome(stamp_ns: int) -> FrameOutcome:

@@ -13,7 +13,7 @@ from share.config import Config
 from share.geometry.camera import Camera
 from share.mapping.query_queue import QueryQueue
 from share.mapping.recognition.patch_alignment import ORB_FEATURES
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived, SendToPeer
 from share.protocol.keyframe_intake import FairQueue, KeyframeQuota
 from share.types import AgentKind, Keyframe, KeyframeImage, View
@@ -95,7 +95,7 @@ def test_the_quota_is_per_name_and_not_per_run() -> None:
 
 
 def test_a_keyframe_beyond_the_quota_is_not_acknowledged_and_is_reported() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     hello, now_ns = hello_of("eve", 5), S
 
     def tell(message: m.Message) -> list[Any]:
@@ -161,7 +161,7 @@ def test_an_extra_keyframe_is_skipped_at_once() -> None:
 
 @pytest.mark.parametrize(("policy", "some"), [("share", True), ("covins-g", False)])
 def test_the_edge_marks_keyframes_beyond_the_rate(policy: str, some: bool) -> None:
-    edge = Edge(replace(Config(), edge=replace(Config().edge, policy=policy)), 8)
+    edge = EdgeProtocol(replace(Config(), edge=replace(Config().edge, policy=policy)), 8)
     edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
     effects = []
     for k in range(100):
@@ -173,7 +173,7 @@ def test_the_edge_marks_keyframes_beyond_the_rate(policy: str, some: bool) -> No
 
 
 def test_a_duplicate_of_a_buffered_keyframe_costs_nothing() -> None:
-    edge = Edge(Config(), 8)
+    edge = EdgeProtocol(Config(), 8)
     edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
     for _ in range(1000):  # keyframe 0 has not come yet; each would cost 2,250
         edge.handle(PeerMessageReceived(m.peer_id(1), encode(keyframe(1, 2000))), 0)
@@ -189,7 +189,7 @@ def test_a_keyframe_that_starts_a_segment_costs_much_more() -> None:
 
 
 def test_buffered_keyframes_are_dropped_when_a_run_leaves_and_requested_again() -> None:
-    edge = Edge(Config(), 8)
+    edge = EdgeProtocol(Config(), 8)
 
     def tell(message: m.UplinkMessage) -> list[Any]:
         effects = edge.handle(PeerMessageReceived(m.peer_id(1), encode(message)), S)

@@ -14,9 +14,9 @@ from share.config import ClockConfig, Config
 from share.errors import UsageError
 from share.geometry import se3
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
-from share.types import Correction, Keyframe, KeyframeCandidate, KeyframeImage, TrackState, View
+from share.types import Correction, Keyframe, KeyframeImage, OdometryKeyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import WIRE_VERSION, decode, encode, message_bytes
 
@@ -36,13 +36,13 @@ def only(kind: type[T], effects: Sequence[ev.AgentEffect], messages: bool = Fals
     return [x for x in (sent(effects) if messages else effects) if isinstance(x, kind)]
 
 
-def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
+def tell(agent: AgentProtocol, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
     return handle(agent, EdgeMessageReceived(encode(message)), now_ns)
 
 
-def welcomed(config: Config | None = None) -> Agent:
+def welcomed(config: Config | None = None) -> AgentProtocol:
     """A connected agent at time 0."""
-    agent = Agent(HELLO, config or Config())
+    agent = AgentProtocol(HELLO, config or Config())
     handle(agent, ev.AgentTick(), 0)
     tell(agent, m.Welcome(SESSION, 0), 0)
     return agent
@@ -67,7 +67,7 @@ def correction(T: np.ndarray, revision: int, answers: int = -1, map_id: str = "a
 
 
 def test_hello_is_repeated_until_a_welcome() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     hellos = [bool(sent(handle(agent, ev.AgentTick(), t * 100 * MS))) for t in range(11)]
     assert [t for t, hello in enumerate(hellos) if hello] == [0, 5, 10]
     effects = tell(agent, m.Welcome(SESSION, 0), 1100 * MS)
@@ -77,7 +77,7 @@ def test_hello_is_repeated_until_a_welcome() -> None:
 
 
 def test_keyframes_are_held_for_as_long_as_the_welcome_says() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     handle(agent, ev.AgentTick(), 0)
     tell(agent, m.Welcome(SESSION, 0, 200.0), MS)
     handle(agent, tracked(0, pose(0), candidate=True), 10 * MS)
@@ -93,7 +93,7 @@ def test_keyframes_are_held_for_as_long_as_the_welcome_says() -> None:
 
 
 def test_an_unanswered_hello_prints_one_line() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     lines = [line for t in range(100) for line in said(handle(agent, ev.AgentTick(), t * 100 * MS))]
     assert lines == ["no edge answers yet; tracking continues without the edge"]
 
@@ -109,7 +109,7 @@ def test_silence_and_reconnection_print_one_line_each() -> None:
 
 
 def test_a_refusal_at_the_start_ends_the_run_with_its_reason() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     handle(agent, ev.AgentTick(), 0)
     [fail] = tell(agent, m.Refused("the name is in use"), 1)
     assert isinstance(fail, FailRun)
@@ -141,7 +141,7 @@ def test_bad_messages_are_counted_and_each_kind_is_printed_once() -> None:
 
 
 def test_another_wire_version_prints_which_side_to_upgrade() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     newer = b"\x94\x09\x01\x90\x90"
     assert said(handle(agent, EdgeMessageReceived([newer]), 0)) == [
         "invalid message from the edge: "
@@ -177,7 +177,7 @@ def test_pings_measure_round_trip_and_clock() -> None:
     assert abs(report["clock_drift_ppm"]) < 1
 
 
-def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[list[float], Agent]:
+def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[list[float], AgentProtocol]:
     """All that is called latency or delay in 30 s of keyframes, each corrected 27 ms after its frame came,
     with an edge whose clock shows `edge_ns` of the agent's."""
     agent, told = welcomed(Config(clock=ClockConfig(claim_ms=claim_ms))), []
@@ -228,7 +228,7 @@ def test_the_clock_offset_is_reported_if_the_setting_allows_its_uncertainty() ->
 
 
 def test_every_frame_is_localised_and_done_with_or_without_an_edge() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     [localised] = only(ev.LocalisedPose, effects := handle(agent, tracked(3, pose(1)), 160 * MS))
     assert (localised.index, localised.T_map_odom, localised.map_id) == (3, None, None)
     np.testing.assert_array_equal(localised.T_odom_body, pose(1))
@@ -267,7 +267,7 @@ def test_a_keyframe_is_of_the_frame_that_it_came_with() -> None:
         handle(agent, tracked(k, pose(k)), 50 * k * MS)
     frame = replace(tracked(3, pose(3)), is_keyframe=True)
     image = KeyframeImage(np.arange(9, dtype=np.uint8), np.zeros((1, 2)), [[0, 0, 0.5]], [0.01])
-    candidate = KeyframeCandidate(pose(3), pose(3), COV, UP, 0.01, View.empty(), True, image)
+    candidate = OdometryKeyframe(pose(3), pose(3), COV, UP, 0.01, View.empty(), True, image)
     effects = agent.handle(frame, 154 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 160 * MS)
     [made] = only(Keyframe, effects, messages=True)
     assert made.stamp_ns == tracked(3).stamp_ns
@@ -306,7 +306,7 @@ def test_keyframes_are_numbered_sent_and_evaluated() -> None:
 
 
 def test_keyframes_made_offline_are_sent_after_the_welcome() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     for k in range(40):
         effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
         assert not only(Keyframe, effects, messages=True)
@@ -370,7 +370,7 @@ def test_a_correction_resets_the_expected_drift() -> None:
 # ---------------------------------------------------------------- corrections
 
 
-def corrected_agent() -> Agent:
+def corrected_agent() -> AgentProtocol:
     """Connected, keyframe 0 of frame 0 sent and acknowledged."""
     agent = welcomed()
     handle(agent, tracked(0, candidate=True), 4 * MS)
@@ -378,7 +378,7 @@ def corrected_agent() -> Agent:
     return agent
 
 
-def in_force(agent: Agent, now_ns: int) -> Any:
+def in_force(agent: AgentProtocol, now_ns: int) -> Any:
     [localised] = only(ev.LocalisedPose, handle(agent, tracked(now_ns // (50 * MS)), now_ns))
     return localised.T_map_odom
 
@@ -483,7 +483,7 @@ def test_the_run_ends_after_all_acknowledgements() -> None:
 
 
 def test_the_run_ends_after_finish_s_without_acknowledgements() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     handle(agent, tracked(0, candidate=True), 0)
     handle(agent, ev.InputFinished(), S)
     stops = [t for t in range(1, 100) if only(ev.CloseLink, handle(agent, ev.AgentTick(), S + t * 100 * MS))]
@@ -492,7 +492,7 @@ def test_the_run_ends_after_finish_s_without_acknowledgements() -> None:
 
 
 def test_the_run_ends_at_once_with_nothing_pending() -> None:
-    effects = Agent(HELLO, Config()).handle(ev.InputFinished(), 0)
+    effects = AgentProtocol(HELLO, Config()).handle(ev.InputFinished(), 0)
     assert isinstance(effects[-1], ev.CloseLink)
     assert not only(m.Bye, effects, messages=True)
 

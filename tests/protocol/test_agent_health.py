@@ -12,7 +12,7 @@ from helpers.model_edge import MS, S
 from share.config import Config
 from share.protocol.agent_health import PoseAges, agent_troubles, trouble_lines
 from share.protocol.common_events import Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
 from share.types import AgentKind, TrackState
 from share.wire import messages as wire
@@ -82,8 +82,8 @@ def test_the_usual_age_is_that_of_the_last_two_seconds() -> None:
     assert seen["over_20ms"] == 30 / 130
 
 
-def edge_with(*messages: wire.UplinkMessage) -> Edge:
-    edge = Edge(Config(), session=5)
+def edge_with(*messages: wire.UplinkMessage) -> EdgeProtocol:
+    edge = EdgeProtocol(Config(), session=5)
     for k, message in enumerate((hello_of("ann", 1), *messages)):
         edge.handle(PeerMessageReceived(wire.peer_id(1), encode(message)), S + k * 50 * MS)
     return edge

@@ -12,7 +12,7 @@ from share.checks import MAX_ID, MAX_STAMP_NS
 from share.config import Config
 from share.geometry import se3
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, PrintLine, SendToEdge
 from share.types import Correction, Keyframe
 from share.wire import messages as m
@@ -41,11 +41,13 @@ def messages(effects: list[ev.AgentEffect]) -> list[m.Message]:
 
 
 def alone(frames: list[ev.FrameTracked]) -> list[tuple[int, int, bytes]]:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     return odometry([e for frame in frames for e in handle(agent, frame, frame.done_ns)])
 
 
-def lied_to(agent: Agent, frames: list[ev.FrameTracked], liar: Liar, each: int) -> list[ev.AgentEffect]:
+def lied_to(
+    agent: AgentProtocol, frames: list[ev.FrameTracked], liar: Liar, each: int
+) -> list[ev.AgentEffect]:
     """Effects of frames, with so many false messages between each two of them."""
     effects: list[ev.AgentEffect] = []
     for frame in frames:
@@ -60,7 +62,7 @@ def lied_to(agent: Agent, frames: list[ev.FrameTracked], liar: Liar, each: int) 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_odometry_does_not_depend_on_a_hostile_edge(seed: int) -> None:
-    frames, agent, liar = walk(400), Agent(HELLO, Config()), Liar(np.random.default_rng(seed))
+    frames, agent, liar = walk(400), AgentProtocol(HELLO, Config()), Liar(np.random.default_rng(seed))
     effects = [e for frame in frames[:100] for e in handle(agent, frame, frame.done_ns)]
     effects += lied_to(agent, frames[100:300], liar, each=8)
     lies = len(effects)
@@ -93,7 +95,7 @@ def test_odometry_does_not_depend_on_a_hostile_edge(seed: int) -> None:
 @pytest.mark.long
 def test_traffic_to_a_hostile_edge_is_bounded() -> None:
     frames, liar = walk(400), Liar(np.random.default_rng(9))
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     for frame in frames[:100]:
         handle(agent, frame, frame.done_ns)
     effects = lied_to(agent, frames[100:], liar, each=20)
@@ -110,8 +112,8 @@ def test_traffic_to_a_hostile_edge_is_bounded() -> None:
 # ---------------------------------------------------------------- one lie at a time
 
 
-def welcomed(frames: int = 0) -> tuple[Agent, int]:
-    agent, now = Agent(HELLO, Config()), 0
+def welcomed(frames: int = 0) -> tuple[AgentProtocol, int]:
+    agent, now = AgentProtocol(HELLO, Config()), 0
     handle(agent, ev.AgentTick(), 0)
     tell(agent, m.Welcome(7, 0), 0)
     for frame in walk(frames):
@@ -120,7 +122,7 @@ def welcomed(frames: int = 0) -> tuple[Agent, int]:
     return agent, now
 
 
-def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
+def tell(agent: AgentProtocol, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
     return handle(agent, EdgeMessageReceived(encode(message)), now_ns)
 
 
@@ -129,7 +131,7 @@ def said(effects: list[ev.AgentEffect]) -> list[str]:
 
 
 def test_a_welcome_beyond_what_was_sent_is_ignored() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     handle(agent, ev.AgentTick(), 0)
     [line] = said(tell(agent, m.Welcome(7, MAX_ID), 0))
     assert line == "the edge sent a welcome of keyframes that were never sent; ignored"
@@ -192,7 +194,7 @@ def test_an_unsolicited_session_is_ignored() -> None:
 
 
 def test_a_late_refusal_does_not_end_the_run() -> None:
-    frames, agent = walk(100), Agent(HELLO, Config())
+    frames, agent = walk(100), AgentProtocol(HELLO, Config())
     for frame in frames:
         handle(agent, frame, frame.done_ns)
     now = frames[-1].done_ns

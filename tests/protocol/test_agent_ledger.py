@@ -11,7 +11,7 @@ import pytest
 from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
 from share.protocol.agent_ledger import KeyframeChain, KeyframeLedger, LedgerEntry, select_earlier
-from share.types import Keyframe, KeyframeCandidate, View
+from share.types import Keyframe, OdometryKeyframe, View
 from share.wire.messages import Ack, Welcome
 
 S = 1_000_000_000
@@ -24,9 +24,9 @@ for step in STEPS:
 COV = np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6
 
 
-def candidate(k: int, new_stretch: bool = False) -> KeyframeCandidate:
+def candidate(k: int, new_stretch: bool = False) -> OdometryKeyframe:
     T_last_body = ODOMETRY[k] if k == 0 or new_stretch else se3.inverse(ODOMETRY[k - 1]) @ ODOMETRY[k]
-    return KeyframeCandidate(ODOMETRY[k], T_last_body, COV, np.array([0, 0, 1.0]), 0.01, EMPTY, new_stretch)
+    return OdometryKeyframe(ODOMETRY[k], T_last_body, COV, np.array([0, 0, 1.0]), 0.01, EMPTY, new_stretch)
 
 
 def entries(n: int, new_segments: tuple[int, ...] = ()) -> list[LedgerEntry]:
@@ -77,7 +77,7 @@ def test_a_segment_starts_even_if_its_first_candidate_was_not_sent() -> None:
     np.testing.assert_array_equal(keyframe.T_ref_body, ODOMETRY[2])
 
 
-def reaching_back(k: int, *candidates: int, new_segment: bool = False) -> KeyframeCandidate:
+def reaching_back(k: int, *candidates: int, new_segment: bool = False) -> OdometryKeyframe:
     """Candidate k with its pose relative to others, that differs from the chain's."""
     T = np.array([se3.inverse(ODOMETRY[i]) @ ODOMETRY[k] @ se3.exp(np.full(6, 0.01)) for i in candidates])
     cov = np.array([(k - i) * COV for i in candidates])

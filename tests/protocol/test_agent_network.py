@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from share.config import AgentConfig, Config
 from share.geometry import se3
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import PrintLine
 from share.types import Keyframe
 
@@ -61,7 +61,7 @@ seeds = st.integers(0, 2**32 - 1)
 def world(walk_seed: int, network: dict[str, float], edge: ModelEdge | None, keep: int = 600) -> World:
     rng = np.random.default_rng(walk_seed)
     config = Config(agent=AgentConfig(keep_keyframes=keep, finish_s=PATIENT))
-    return World(Agent(HELLO, config), edge, lambda: Network(rng, **network))
+    return World(AgentProtocol(HELLO, config), edge, lambda: Network(rng, **network))
 
 
 def finish(run: World) -> None:

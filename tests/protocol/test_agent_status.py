@@ -9,16 +9,16 @@ from helpers.model_edge import HELLO, MS, S, tracked
 
 from share.config import Config
 from share.protocol import agent_events as ev
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, SendToEdge
 from share.types import TrackState, WaitReason
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
 
-def agent_with(frames: int, ms: float = 4.0) -> tuple[Agent, int]:
+def agent_with(frames: int, ms: float = 4.0) -> tuple[AgentProtocol, int]:
     """An agent that has tracked so many frames, 50 ms apart, each done `ms` after it came; and now."""
-    agent, now = Agent(HELLO, Config()), 0
+    agent, now = AgentProtocol(HELLO, Config()), 0
     agent.handle(ev.AgentTick(), 0)
     for k in range(frames):
         frame = tracked(k, ms=ms)
@@ -28,7 +28,7 @@ def agent_with(frames: int, ms: float = 4.0) -> tuple[Agent, int]:
     return agent, now
 
 
-def heard_again(agent: Agent, now_ns: int) -> None:
+def heard_again(agent: AgentProtocol, now_ns: int) -> None:
     """Connect the agent."""
     agent.handle(EdgeMessageReceived(encode(m.Welcome(1, 0))), now_ns)
 
@@ -94,7 +94,7 @@ def test_a_hanging_tracker_is_not_reported_as_a_missing_camera() -> None:
 
 
 def test_a_slow_camera_is_not_lost_between_frames() -> None:
-    agent, now = Agent(HELLO, Config()), 0
+    agent, now = AgentProtocol(HELLO, Config()), 0
     agent.handle(ev.AgentTick(), 0)
     for k in range(30):  # 2 Hz
         now = k * 500 * MS
@@ -105,7 +105,7 @@ def test_a_slow_camera_is_not_lost_between_frames() -> None:
 
 def test_a_missing_camera_is_reported_within_a_second_on_a_slow_machine() -> None:
     """On a busy machine a frame took 0.9 s, and the missing camera was reported after 2.7 s."""
-    agent, now = Agent(HELLO, Config()), 0
+    agent, now = AgentProtocol(HELLO, Config()), 0
     agent.handle(ev.AgentTick(), 0)
     for k in range(30):
         now = k * 900 * MS
@@ -130,7 +130,7 @@ def test_each_state_has_its_reason() -> None:
 
 
 def test_a_run_without_any_image_is_reported() -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     agent.handle(ev.AgentTick(), 7 * S)
     agent.handle(ev.AgentTick(), 9 * S)
     assert agent.status(9 * S) == m.Status(TrackState.INITIALISING, 2000.0, "no image for 2.0 s")

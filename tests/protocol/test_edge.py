@@ -24,7 +24,7 @@ from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.common_events import PrintLine, Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -174,13 +174,13 @@ def hello(name: str = "ann", run_id: int = 1) -> m.Hello:
     return hello_of(name, run_id)
 
 
-def tell(edge: Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.EdgeEffect]:
+def tell(edge: EdgeProtocol, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.EdgeEffect]:
     frames = [bytes(f) for f in encode(message)]
     return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames), round(now_ms * MS))
 
 
 def test_a_name_in_use_is_refused_until_its_run_is_silent():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     assert sent(tell(edge, 1, hello()), m.Welcome) == [m.Welcome(7, 0)]
     refused = tell(edge, 2, hello(run_id=2), 100)
     assert "in use" in sent(refused, m.Refused)[0].reason
@@ -189,7 +189,7 @@ def test_a_name_in_use_is_refused_until_its_run_is_silent():
 
 
 def test_the_mapper_gets_the_presence_of_runs():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, 1, hello())
     told = [
         [e.is_present for e in effects if isinstance(e, ed.SetPresence)]
@@ -205,7 +205,7 @@ def test_the_mapper_gets_the_presence_of_runs():
 
 
 def test_a_name_is_free_at_once_after_a_bye():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, 1, hello())
     tell(edge, 1, m.Bye(), 10)
     assert sent(tell(edge, 2, hello(run_id=2), 20), m.Welcome)
@@ -213,7 +213,7 @@ def test_a_name_is_free_at_once_after_a_bye():
 
 def test_the_scheduler_knows_who_shares_a_map_with_somebody(monkeypatch):
     reports = recorded_reports(monkeypatch)
-    edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
+    edge = EdgeProtocol(Config(edge=EdgeConfig(policy="share")), 7)
 
     def evaluate() -> bool:
         tell(edge, 1, m.Evaluation(0, 50.0, 1.0))
@@ -240,7 +240,7 @@ def test_the_scheduler_knows_who_shares_a_map_with_somebody(monkeypatch):
 
 def test_max_agents_is_kept():
     config = Config()
-    edge = Edge(replace(config, edge=replace(config.edge, max_agents=2)), 7)
+    edge = EdgeProtocol(replace(config, edge=replace(config.edge, max_agents=2)), 7)
     tell(edge, 1, hello("a", 1))
     tell(edge, 2, hello("b", 2))
     assert "2 agents" in sent(tell(edge, 3, hello("c", 3)), m.Refused)[0].reason
@@ -249,7 +249,7 @@ def test_max_agents_is_kept():
 
 
 def test_unjoined_peers_get_a_pong_and_nothing_else():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     pong = sent(tell(edge, 5, m.Ping(3, 42), 9), m.Pong)
     assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, 7)]
     assert not sent(tell(edge, 5, m.Evaluation(0, 1.0, None)), m.Message)
@@ -257,7 +257,7 @@ def test_unjoined_peers_get_a_pong_and_nothing_else():
 
 
 def test_malformed_messages_are_counted_and_recorded_once():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, 1, hello())
     records = []
     for k in range(1000):
@@ -271,7 +271,7 @@ def test_malformed_messages_are_counted_and_recorded_once():
 def test_a_keyframe_is_applied_once_and_in_order():
     both = town()
     both.walk(6)
-    edge, entries = Edge(Config(), 7), both.keyframes("ann")[:4]
+    edge, entries = EdgeProtocol(Config(), 7), both.keyframes("ann")[:4]
     tell(edge, 11, hello(run_id=11))
     acks = [sent(tell(edge, 11, entries[k]), m.Ack)[0] for k in (1, 0, 1, 3, 2)]
     assert [ack.next_keyframe for ack in acks] == [0, 2, 2, 2, 4]
@@ -286,9 +286,9 @@ def test_a_step_that_fails_costs_its_keyframe_only():
     mapper.add_run("ann-000b", hello(run_id=11))
     mapper.add_keyframe("ann-000b", both.keyframes("ann")[0])
     look = mapper.next_lookup()
-    (finding,) = mapper.finish_step(look, MemoryError("no room"), 1.0)
-    assert (finding.event, finding.agent) == ("step failed", "ann-000b")
-    assert "no room" in finding.reason
+    (map_event,) = mapper.finish_step(look, MemoryError("no room"), 1.0)
+    assert (map_event.event, map_event.agent) == ("step failed", "ann-000b")
+    assert "no room" in map_event.reason
     assert mapper.report()["failed_steps"] == 1
     assert mapper.next_lookup() is None
 
@@ -306,13 +306,13 @@ def two_maps() -> Mapper:
 
 def test_a_solution_that_fails_is_reported_under_its_map():
     """It is no agent's, also where all keyframes of the map are."""
-    mapper, edge = two_maps(), Edge(Config(), 7)
+    mapper, edge = two_maps(), EdgeProtocol(Config(), 7)
     tell(edge, 11, hello(run_id=11))
-    findings = []
+    map_events = []
     for text in ("no pivot", "no memory"):
         step = mapper.next_solve()
-        findings += mapper.finish_step(step, RuntimeError(text), 1.0)
-    effects = edge.handle(ed.MapperResult(findings), 2 * 10**9)
+        map_events += mapper.finish_step(step, RuntimeError(text), 1.0)
+    effects = edge.handle(ed.MapperResult(map_events), 2 * 10**9)
     lines = [effect.fields for effect in effects if isinstance(effect, ed.WriteEvent)]
     assert [(line["event"], line["agent"], line["map_id"]) for line in lines] == [
         ("step failed", None, "ann-1/0"),
@@ -338,7 +338,7 @@ def test_a_map_that_cannot_be_prepared_for_the_solver_is_reported(monkeypatch):
 
 
 def test_failures_of_one_map_do_not_hide_those_of_another():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     failures = [MapEvent(None, "step failed", "map a/0: solve: x", map_id="a/0")] * 100
     edge.handle(ed.MapperResult(failures), 10**9)
     other = ed.MapperResult([MapEvent(None, "step failed", "map b/0: solve: x", map_id="b/0")])

@@ -13,7 +13,7 @@ from helpers.reports import recorded_reports
 from share.config import Config, EdgeConfig
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import SaveChanges
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
@@ -34,7 +34,7 @@ def keyframe(id: int) -> Keyframe:
 
 
 def tell(
-    edge: Edge, run_id: int, message: m.Message, now_s: float = 0, names: Iterable[str] | None = None
+    edge: EdgeProtocol, run_id: int, message: m.Message, now_s: float = 0, names: Iterable[str] | None = None
 ) -> list[ed.EdgeEffect]:
     """names: that its key is authorised for; None: no keys are used."""
     frames, owned = [bytes(frame) for frame in encode(message)], None if names is None else frozenset(names)
@@ -42,7 +42,7 @@ def tell(
     return edge.handle(ed.PeerMessageReceived(m.peer_id(run_id), frames, owned, key), round(now_s * S))
 
 
-def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.EdgeEffect]:
+def come(edge: EdgeProtocol, name: str, run_id: int, now_s: float = 0) -> list[ed.EdgeEffect]:
     return tell(edge, run_id, hello_of(name, run_id), now_s)
 
 
@@ -55,7 +55,7 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
-def present(edge: Edge) -> int:
+def present(edge: EdgeProtocol) -> int:
     return sum(not agent["gone"] for agent in edge.report({})["agents"].values())
 
 
@@ -65,7 +65,7 @@ def present(edge: Edge) -> int:
 @pytest.mark.long
 def test_new_runs_of_one_name_are_limited() -> None:
     """130 runs a second of one name for 20 s, each with a bye: 8 and one each 10 s are admitted."""
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     for k in range(2600):
         come(edge, "eve", k, k / 130)
         tell(edge, k, keyframe(0), k / 130)
@@ -75,7 +75,7 @@ def test_new_runs_of_one_name_are_limited() -> None:
 
 
 def test_too_many_new_runs_are_refused_with_the_time_to_wait() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     for k in range(8):
         assert refusal(come(edge, "eve", k, 1)) is None
         tell(edge, k, m.Bye(), 1)
@@ -85,7 +85,7 @@ def test_too_many_new_runs_are_refused_with_the_time_to_wait() -> None:
 
 
 def test_new_runs_of_all_names_are_limited() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     for k in range(128):
         assert refusal(come(edge, f"eve{k}", k)) is None
         tell(edge, k, m.Bye())
@@ -96,7 +96,7 @@ def test_new_runs_of_all_names_are_limited() -> None:
 @pytest.mark.long
 def test_new_runs_of_one_key_do_not_keep_others_out() -> None:
     """100 names join and leave 50 times a second, for a minute."""
-    edge, names, taken = Edge(Config(), 7), [f"eve{k}" for k in range(100)], 0
+    edge, names, taken = EdgeProtocol(Config(), 7), [f"eve{k}" for k in range(100)], 0
     for k in range(3000):
         came = tell(edge, k, hello_of(names[k % 100], k), k / 50, names)
         reason = refusal(came)
@@ -108,7 +108,7 @@ def test_new_runs_of_one_key_do_not_keep_others_out() -> None:
 
 
 def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     assert refusal(tell(edge, 1, hello_of("zoe", 1), 0, ["zoe"])) is None
     assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.SendToPeer)  # so it is silent, and says hello
     why = (
@@ -132,7 +132,7 @@ def test_a_known_run_may_return_at_any_rate() -> None:
         RestoredRun(f"bob-{k:04x}", hello_of("bob", 100 + k), OdometryBase(4, 0, np.eye(4)))
         for k in range(12)
     ]
-    edge = Edge(Config(), 7, has_store=True, restored=known)
+    edge = EdgeProtocol(Config(), 7, has_store=True, restored=known)
     for _ in range(200):  # a hello that is repeated, and a reconnect
         assert refusal(come(edge, "ann", 1)) is None
     for k in range(12):  # of the map's file
@@ -146,7 +146,7 @@ def test_a_known_run_may_return_at_any_rate() -> None:
 
 
 def test_a_refused_hello_does_not_count_as_a_new_run() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     come(edge, "ann", 1)
     for _ in range(20):
         assert "in use" in str(refusal(come(edge, "ann", 2)))
@@ -155,7 +155,7 @@ def test_a_refused_hello_does_not_count_as_a_new_run() -> None:
 
 
 def test_runs_without_a_keyframe_are_forgotten() -> None:
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     assert not of(come(edge, "ann", 1), SaveChanges)
     (keep,) = of(tell(edge, 1, keyframe(0)), SaveChanges)
     assert [type(change) for change in keep.changes] == [SaveRun, SaveKeyframe]
@@ -172,7 +172,7 @@ def test_runs_without_a_keyframe_are_forgotten() -> None:
     ids=lambda message: type(message).__name__,
 )
 def test_an_earlier_run_does_not_return_beside_the_present_one(message: m.Message) -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     come(edge, "hope", 1)
     tell(edge, 1, m.Bye())
     come(edge, "hope", 2)
@@ -192,7 +192,7 @@ def test_an_earlier_run_does_not_return_beside_the_present_one(message: m.Messag
 def test_a_run_that_left_returns_only_to_a_free_place() -> None:
     """The edge is full of runs of other names after a run has left."""
     config = Config()
-    edge = Edge(replace(config, edge=replace(config.edge, max_agents=4)), 7)
+    edge = EdgeProtocol(replace(config, edge=replace(config.edge, max_agents=4)), 7)
     for k in range(8):
         assert refusal(come(edge, f"eve{k}", k)) is None
         tell(edge, k, m.Bye())
@@ -204,7 +204,7 @@ def test_a_run_that_left_returns_only_to_a_free_place() -> None:
 
 def test_a_silent_run_loses_its_name() -> None:
     """Also before the next tick of the edge."""
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     come(edge, "ann", 1)
     effects = come(edge, "ann", 2, 3.5)
     assert [(e.key, e.is_present) for e in of(effects, ed.SetPresence)] == [
@@ -215,7 +215,7 @@ def test_a_silent_run_loses_its_name() -> None:
 
 
 def test_a_killed_and_restarted_agent_joins_once_its_name_is_free() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     come(edge, "ann", 1)
     tell(edge, 1, m.Ping(1, 1), 1)
     assert "in use" in str(refusal(come(edge, "ann", 2, 1.5)))  # it has a ping's time to answer for itself
@@ -231,7 +231,7 @@ def test_a_killed_and_restarted_agent_joins_once_its_name_is_free() -> None:
 
 
 def test_a_repeated_bye_has_no_effect() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     come(edge, "ann", 1)
     tell(edge, 1, m.Bye())
     assert tell(edge, 1, m.Bye()) == []
@@ -269,7 +269,7 @@ def robot(name, run_id):
 
 @pytest.fixture
 def full_edge(monkeypatch):
-    edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
+    edge = EdgeProtocol(Config(edge=EdgeConfig(policy="share")), 7)
     come(edge, "ann", 1)
     tell(edge, 2, robot("bob", 2))
     monkeypatch.setattr(edge._rate_scheduler, "_policy", FullRoom(Config().control))
@@ -315,11 +315,11 @@ def evaluated(edge, kinds, seconds=12):
 
 def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none():
     headset, bot = [AgentKind.AR], [AgentKind.ROBOT]
-    few = Edge(Config(), 7)
+    few = EdgeProtocol(Config(), 7)
     now_s = evaluated(few, 8 * headset + 4 * bot)
     assert refusal(tell(few, 100, robot("late", 100), now_s)) is None
 
-    crowded = Edge(Config(), 7)
+    crowded = EdgeProtocol(Config(), 7)
     now_s = evaluated(crowded, 15 * headset + 5 * bot)
     assert "no air for one more robot" in refusal(tell(crowded, 100, robot("late", 100), now_s))
     assert "no air left beside headsets" in refusal(come(crowded, "eve", 101, now_s))
@@ -327,7 +327,7 @@ def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none()
     assert not agents["eve"]["gone"]
     assert [name for name, agent in agents.items() if agent["gone"]] == ["a18", "a19"]
 
-    full = Edge(Config(), 7)
+    full = EdgeProtocol(Config(), 7)
     now_s = evaluated(full, 20 * headset)
     assert "no air for one more headset" in refusal(come(full, "eve", 101, now_s))
     assert refusal(come(full, "eve", 101, now_s + 60)) is None  # all others have fallen silent
@@ -335,7 +335,7 @@ def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none()
 
 def test_policies_without_a_budget_turn_nobody_away():
     config = Config(edge=EdgeConfig(policy="covins-g"))
-    edge = Edge(config, 7)
+    edge = EdgeProtocol(config, 7)
     now_s = evaluated(edge, [AgentKind.AR] * 20)
     assert refusal(come(edge, "eve", 101, now_s)) is None
 
@@ -343,7 +343,7 @@ def test_policies_without_a_budget_turn_nobody_away():
 def test_the_edge_sees_how_long_a_keyframe_takes_to_arrive(monkeypatch):
     """From the message before it; of a copy, and of what arrives without one before, it learns nothing."""
     reports = recorded_reports(monkeypatch)
-    edge = Edge(Config(edge=EdgeConfig(policy="share")), 7)
+    edge = EdgeProtocol(Config(edge=EdgeConfig(policy="share")), 7)
     said = m.Evaluation(0, 50.0, 1.0)
     come(edge, "ann", 1, 0.0)
     tell(edge, 1, said, 1.0)

@@ -61,8 +61,8 @@ def test_a_wrong_agent_does_not_distort_the_map_of_others(bad):
     assert town.edge.report()["failed_steps"] == 0
     assert town.map_error(GOOD) <= MOST_M
     states = {name: agent["consistency"]["state"] for name, agent in maps.items()}
-    assert all(states[name] != "set apart" for name in GOOD)
+    assert all(states[name] != "quarantined" for name in GOOD)
     if bad in APART:
-        assert states["eve"] == "set apart"
+        assert states["eve"] == "quarantined"
         assert maps["eve"]["map_id"] != maps["ann"]["map_id"]
         assert any(r["event"] == "agent quarantined" and "calibration" in r["reason"] for r in town.records)

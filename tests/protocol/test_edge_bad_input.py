@@ -16,9 +16,9 @@ from share.mapping.mapper import Mapper
 from share.mapping.steps import QueryStep
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import Connected, EdgeMessageReceived, PrintLine, SendToEdge
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
@@ -35,7 +35,7 @@ def keyframe(id: int, cov: np.ndarray | None = None, view: View = EMPTY) -> Keyf
     return Keyframe(id, id - 1, 10**8 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, view, id - 1)
 
 
-def tell(edge: Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.EdgeEffect]:
+def tell(edge: EdgeProtocol, message: m.Message, peer: int = HELLO.run_id) -> list[ed.EdgeEffect]:
     return edge.handle(ed.PeerMessageReceived(m.peer_id(peer), [bytes(f) for f in encode(message)]), 0)
 
 
@@ -56,7 +56,7 @@ def sent(effects: list, kind: type) -> list:
     ids=["pose", "covariance not positive", "covariance not finite", "place", "up", "uv"],
 )
 def test_non_finite_numbers_are_refused_when_decoded(frame, value):
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     view = View(np.zeros((2, 2)), np.ones((2, 3)), np.zeros((2, 32), np.uint8))
     frames = [bytearray(f) for f in encode(keyframe(0, view=view))]
@@ -72,7 +72,7 @@ def test_non_finite_numbers_are_refused_when_decoded(frame, value):
 
 
 def test_a_reused_keyframe_id_changes_nothing():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     assert of(tell(edge, keyframe(0)), ed.AddKeyframe)
     effects = tell(edge, replace(keyframe(0), stamp_ns=5, up=np.array([0.0, 0.6, 0.8])))
@@ -82,14 +82,16 @@ def test_a_reused_keyframe_id_changes_nothing():
 
 def test_two_runs_whose_tags_start_alike_have_different_keys():
     tag = m.public_tag(0xB000B)
-    edge = Edge(Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)))])
+    edge = EdgeProtocol(
+        Config(), 8, restored=[RestoredRun(f"ann-{tag[:4]}", HELLO, OdometryBase(0, 0, np.eye(4)))]
+    )
     (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.AddRun)
     assert join.key == f"ann-{tag[:5]}"
     assert of(tell(edge, keyframe(0), 0xB000B), ed.AddKeyframe)[0].key == f"ann-{tag[:5]}"
 
 
 def test_an_excessive_covariance_is_bounded_and_recorded():
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, keyframe(0, 1e11 * np.eye(6)))
     assert np.allclose(of(effects, ed.AddKeyframe)[0].keyframe.cov, 100 * np.eye(6))
@@ -121,9 +123,9 @@ def test_an_unusable_result_costs_its_step_only(monkeypatch):
         raise ValueError("no such thing")
 
     monkeypatch.setattr(mapper.atlas.loop_acceptance, "review_joins", bad)
-    (finding,) = mapper.finish_step(step, step.run(), 1.0)
-    assert finding.event == "step failed"
-    assert finding.reason.startswith("place: ValueError: no such thing")
+    (map_event,) = mapper.finish_step(step, step.run(), 1.0)
+    assert map_event.event == "step failed"
+    assert map_event.reason.startswith("place: ValueError: no such thing")
     monkeypatch.undo()
     mapper.add_keyframe("ann", keyframe(1))
     step = mapper.next_lookup()
@@ -157,7 +159,7 @@ def test_ten_thousand_keyframes_at_once_are_bounded():
 
 def test_a_hello_is_sent_at_once_when_the_link_is_back():
     """A new session of the edge is known by its welcome, not only by the answer to the next ping."""
-    agent, edge = Agent(HELLO, Config()), Edge(Config(), 7)
+    agent, edge = AgentProtocol(HELLO, Config()), EdgeProtocol(Config(), 7)
     hello = agent.handle(Connected(), 0)
     assert sent(hello, m.Hello)
     (welcome,) = sent(tell(edge, HELLO), m.Welcome)
@@ -171,7 +173,7 @@ def test_a_hello_is_sent_at_once_when_the_link_is_back():
 def test_the_newest_correction_comes_with_the_welcome():
     """Until then it has revisions of the earlier session, and would reject it."""
     known = RestoredRun("ann-000b", HELLO, OdometryBase(0, 0, np.eye(4)))
-    edge, mapper = Edge(Config(), 8, restored=[known]), Mapper(Config())
+    edge, mapper = EdgeProtocol(Config(), 8, restored=[known]), Mapper(Config())
     mapper.add_run("ann-000b", HELLO)
     tell(edge, m.Ping(1, 0))
     effects = edge.handle(ed.MapperResult(tuple(mapper.add_keyframe("ann-000b", keyframe(0)))), 0)

@@ -14,7 +14,7 @@ from share.checks import MAX_ID
 from share.config import Config
 from share.mapping.map_changes import SaveCredential
 from share.protocol import edge_events as ed
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
@@ -33,7 +33,7 @@ def keyframe(id: int) -> Keyframe:
 
 
 def tell(
-    edge: Edge,
+    edge: EdgeProtocol,
     message: m.Message,
     names: frozenset[str] | None,
     peer: int = SECRET,
@@ -53,7 +53,7 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
 
 
 def test_a_key_is_authorised_for_its_names_only() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
     assert isinstance(refused, m.Refused)
     assert "authorized for 'eve', 'mallory', not for 'ann'" in refused.reason
@@ -64,7 +64,7 @@ def test_a_key_is_authorised_for_its_names_only() -> None:
 
 def test_a_run_is_not_taken_over_by_another_key() -> None:
     """The attacker knows the run id and has taken over the transport id."""
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, hello_of("ann", SECRET), ANN)
     tell(edge, keyframe(0), ANN)
     for message in (keyframe(1), m.Bye(), hello_of("ann", SECRET), m.Evaluation(0, 1.0, 1.0), m.Ping(1, 0)):
@@ -76,7 +76,7 @@ def test_a_run_is_not_taken_over_by_another_key() -> None:
 
 
 def test_without_keys_the_run_id_identifies_a_run() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     assert of(tell(edge, keyframe(0), None), ed.AddKeyframe)
     welcome, _ = sent(tell(edge, hello_of("ann", SECRET), None, now_ns=10**9))  # connected again
@@ -86,7 +86,7 @@ def test_without_keys_the_run_id_identifies_a_run() -> None:
 
 
 def test_no_output_reveals_the_run_id() -> None:
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     effects = tell(edge, hello_of("ann", SECRET), None) + tell(edge, keyframe(0), None)
     shown = [edge.report({}), edge.series(), *(e.fields for e in of(effects, ed.WriteEvent))]
     keys = [e.key for e in of(effects, ed.AddRun)]
@@ -97,7 +97,7 @@ def test_no_output_reveals_the_run_id() -> None:
 
 @pytest.mark.parametrize("number", [5 * 10**7, 10**9, MAX_ID])
 def test_a_jump_of_ids_costs_one_message(number: int) -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, hello_of("ann", SECRET), None)
     tell(edge, keyframe(0), None)
     effects = tell(edge, replace(keyframe(1), id=number, reference=-1, predecessor=-1), None)
@@ -109,14 +109,14 @@ def test_a_jump_of_ids_costs_one_message(number: int) -> None:
 
 @pytest.mark.parametrize("name", ["n" * 57, "n" * 58, "n" * 64, "é" * 64, "日" * 64])
 def test_the_map_of_an_agent_with_a_long_name_can_be_sent(name: str) -> None:
-    (join,) = of(tell(Edge(Config(), 7), hello_of(name, SECRET), None), ed.AddRun)
+    (join,) = of(tell(EdgeProtocol(Config(), 7), hello_of(name, SECRET), None), ed.AddRun)
     map_id = f"{join.key}/999999"  # of its segment of that number
     sent_back = decode(encode(m.Correction(np.eye(4), np.eye(6), map_id, 1, 0, 0)))
     assert isinstance(sent_back, m.Correction) and sent_back.map_id == map_id
 
 
 def test_the_credential_of_a_run_follows_the_authorised_key() -> None:
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     (join,) = of(tell(edge, hello_of("eve", SECRET), EVE, key="E"), ed.AddRun)
     (other,) = of(tell(edge, hello_of("mallory", 5), frozenset({"bob", "mallory"}), 5, key="E"), ed.AddRun)
     assert join.credential == other.credential == "E"
@@ -133,7 +133,7 @@ def test_a_restored_run_takes_the_credential_of_its_sender(kept: str | None, mes
     known = RestoredRun(
         "eve-1234", hello_of("eve", SECRET), OdometryBase.from_keyframe(keyframe(2)), credential=kept
     )
-    edge = Edge(Config(), 7, has_store=True, restored=[known])
+    edge = EdgeProtocol(Config(), 7, has_store=True, restored=[known])
     effects = tell(edge, message, EVE, now_ns=1, key="E")
     changes = [change for keep in of(effects, ed.SaveChanges) for change in keep.changes]
     if kept == "E":
@@ -148,7 +148,10 @@ def test_a_restored_run_takes_the_credential_of_its_sender(kept: str | None, mes
 
 def test_no_name_equals_the_label_of_an_earlier_run() -> None:
     """The key of eve's first run is the honest agent's name, by choice of the run id."""
-    edge, number = Edge(Config(), 7), next(n for n in range(10**6) if m.public_tag(n).startswith("0001"))
+    edge, number = (
+        EdgeProtocol(Config(), 7),
+        next(n for n in range(10**6) if m.public_tag(n).startswith("0001")),
+    )
     tell(edge, hello_of("eve-0001", SECRET), None)
     for run, now_ns in ((number, 1), (5, 2)):
         tell(edge, hello_of("eve", run), None, run, now_ns)
@@ -166,7 +169,7 @@ def test_no_name_equals_the_label_of_an_earlier_run() -> None:
 
 def test_labels_of_earlier_runs_are_unique() -> None:
     """For any order of joining."""
-    edge, run = Edge(Config(), 7), 0
+    edge, run = EdgeProtocol(Config(), 7), 0
     for name in ("a", "a-b", "a-b.c", "a"):
         for _ in range(3):
             run += 1

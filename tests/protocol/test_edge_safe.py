@@ -12,7 +12,7 @@ from share.config import Config
 from share.geometry import se3
 from share.mapping.map_changes import SaveKeyframe, SaveRun
 from share.protocol import edge_events as ed
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
 from share.types import F64, Keyframe, View
@@ -43,7 +43,7 @@ def keyframe(
     )
 
 
-def tell(edge: Edge, message: m.Message) -> list[ed.EdgeEffect]:
+def tell(edge: EdgeProtocol, message: m.Message) -> list[ed.EdgeEffect]:
     return edge.handle(ed.PeerMessageReceived(m.peer_id(11), [bytes(f) for f in encode(message)]), 0)
 
 
@@ -57,7 +57,7 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
 
 
 def test_nothing_is_acknowledged_before_it_is_stored() -> None:
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     tell(edge, HELLO)
     effects = tell(edge, keyframe(0, -1))
     (keep,) = of(effects, ed.SaveChanges)
@@ -71,7 +71,7 @@ def test_nothing_is_acknowledged_before_it_is_stored() -> None:
 
 
 def test_several_stored_at_once_are_acknowledged_once() -> None:
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     tell(edge, HELLO)
     keeps = [of(tell(edge, keyframe(k, k - 1)), ed.SaveChanges)[0] for k in range(3)]
     assert acks(edge.handle(ed.ChangesSaved(keeps[1].ticket), 0)) == [m.Ack(2, (2,))]
@@ -80,7 +80,7 @@ def test_several_stored_at_once_are_acknowledged_once() -> None:
 
 def test_a_restored_run_continues() -> None:
     foot = OdometryBase(4, 800 * MS, at(0.8))
-    edge = Edge(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot)])
+    edge = EdgeProtocol(Config(), 8, has_store=True, restored=[RestoredRun("ann-000b", HELLO, foot)])
     effects = tell(edge, HELLO)
     welcome, _ = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.SendToPeer)]
     assert welcome == m.Welcome(8, 5)
@@ -92,7 +92,7 @@ def test_a_restored_run_continues() -> None:
 
 
 def test_an_implausible_jump_starts_a_segment_in_the_same_odom() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     effects = tell(edge, keyframe(1, 0, forward_m=100.0))
@@ -115,7 +115,7 @@ def test_an_implausible_jump_starts_a_segment_in_the_same_odom() -> None:
     ],
 )
 def test_a_motion_that_contradicts_its_two_poses_starts_a_segment(bad: dict[str, float], off: str) -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     effects = tell(edge, keyframe(1, 0, **bad))
@@ -133,7 +133,7 @@ def test_a_motion_that_contradicts_its_two_poses_starts_a_segment(bad: dict[str,
 
 
 def test_a_keyframe_with_a_bounded_variance_is_not_refused() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     for id in range(12):
         sure = keyframe(id, id - 1)
@@ -148,7 +148,7 @@ def test_a_keyframe_with_a_bounded_variance_is_not_refused() -> None:
 
 def test_a_later_estimate_of_the_past_is_no_contradiction() -> None:
     """Differences larger than those measured of correct agents."""
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     (add,) = of(tell(edge, keyframe(1, 0, yaw=float(np.radians(5.0)))), ed.AddKeyframe)
@@ -165,7 +165,7 @@ def at(x: float) -> F64:
 
 
 def test_a_long_motion_in_a_long_time_is_no_jump() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     (add,) = of(tell(edge, keyframe(1, 0, forward_m=20.0, stamp_ms=10_000)), ed.AddKeyframe)
@@ -173,7 +173,7 @@ def test_a_long_motion_in_a_long_time_is_no_jump() -> None:
 
 
 def test_a_reference_that_is_not_the_last_keyframe_is_refused() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     tell(edge, keyframe(1, 0))
@@ -186,7 +186,7 @@ def test_a_reference_that_is_not_the_last_keyframe_is_refused() -> None:
 
 
 def test_a_run_id_is_not_shared_by_two_names() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, hello_of("eve", 11))
     (refused,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.SendToPeer)]
@@ -197,7 +197,7 @@ def test_a_run_id_is_not_shared_by_two_names() -> None:
 def test_keyframes_waiting_for_the_disk_are_bounded(monkeypatch) -> None:
     """Keyframes of an agent that ignores the window are deferred beyond a bound, and none is lost."""
     monkeypatch.setattr("share.protocol.peer._MAX_PENDING_SAVES", 5)
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     tell(edge, HELLO)
     keeps = [keep for k in range(20) for keep in of(tell(edge, keyframe(k, k - 1)), ed.SaveChanges)]
     assert len(keeps) == 5
@@ -211,7 +211,7 @@ def test_keyframes_waiting_for_the_disk_are_bounded(monkeypatch) -> None:
 
 
 def test_a_keyframe_that_is_refused_waits_for_no_disk() -> None:
-    edge = Edge(Config(), 7, has_store=True)
+    edge = EdgeProtocol(Config(), 7, has_store=True)
     tell(edge, HELLO)
     keeps = [of(tell(edge, keyframe(k, k - 1)), ed.SaveChanges)[0] for k in range(2)]
     edge.handle(ed.ChangesSaved(keeps[-1].ticket), 0)

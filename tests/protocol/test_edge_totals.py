@@ -8,7 +8,7 @@ from helpers.hellos import hello_of
 
 from share.config import Config
 from share.mapping.mapper import Mapper
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import AddRun, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
 from share.runtime import edge_metrics
@@ -18,7 +18,7 @@ from share.wire.codec import encode
 
 def life(session: int, poses: int, solves: int) -> dict[str, Any]:
     """The report of an edge with so many messages of ann and of an unjoined peer, and so many solutions."""
-    edge, mapper = Edge(Config(), session), Mapper(Config())
+    edge, mapper = EdgeProtocol(Config(), session), Mapper(Config())
 
     def tell(run_id: int, message: m.Message) -> None:
         for effect in edge.handle(
@@ -64,7 +64,7 @@ def test_counts_continue_after_a_restart_of_the_mapper() -> None:
 def test_earlier_counts_are_reported_before_the_next_mapper_reports() -> None:
     totals, before = SessionTotals(), life(1, 3, 5)
     totals.add_session(totals.with_totals(before))
-    silent = Edge(Config(), 2).report({})
+    silent = EdgeProtocol(Config(), 2).report({})
     added = totals.with_totals(silent)
     assert (added["loops"], added["solve_ms"]) == ({"tried": 5}, {"n": 5})
     assert b"share_edge_loops_tried_total" not in edge_metrics.render_metrics(added)[0]  # of no agent
@@ -81,6 +81,6 @@ def test_another_run_of_a_name_counts_separately() -> None:
 def test_the_counts_of_an_agent_survive_a_session_without_it() -> None:
     totals, heard = SessionTotals(), life(1, 3, 5)
     totals.add_session(totals.with_totals(heard))
-    totals.add_session(totals.with_totals(Edge(Config(), 2).report({})))
+    totals.add_session(totals.with_totals(EdgeProtocol(Config(), 2).report({})))
     added = totals.with_totals(life(3, 3, 5))
     assert numbers(added, "agents.ann.bytes_up") == 2 * numbers(heard, "agents.ann.bytes_up")

@@ -13,7 +13,7 @@ from share.earlier_poses import EarlierPoses
 from share.geometry.camera import Camera
 from share.mapping.corrections import MapEvent
 from share.protocol import edge_events as ed
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.keyframe_intake import OdometryBase, StepChain, sanitise
 from share.types import Keyframe, KeyframeImage, View
 from share.vision.image_codec import encode_jpeg
@@ -91,7 +91,7 @@ def test_all_that_is_wrong_is_said() -> None:
 
 
 def test_the_edge_records_it_once_and_keeps_the_keyframe() -> None:
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
 
     def tell(message: m.Message) -> list[ed.EdgeEffect]:
         frames = [bytes(frame) for frame in encode(message)]
@@ -119,7 +119,7 @@ def test_a_header_larger_than_any_camera_is_not_decoded() -> None:
 
 def test_a_suspicion_of_the_mapper_counts_as_one_of_the_intake() -> None:
     """It alone decodes images."""
-    edge = Edge(Config(), 7)
+    edge = EdgeProtocol(Config(), 7)
     frames = [bytes(frame) for frame in encode(HELLO)]
     effects = edge.handle(ed.PeerMessageReceived(m.peer_id(HELLO.run_id), frames), 0)
     (key,) = (effect.key for effect in effects if isinstance(effect, ed.AddRun))

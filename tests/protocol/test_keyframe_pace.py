@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from share.protocol.keyframe_pace import KeyframePace
-from share.types import KeyframeCandidate, View
+from share.types import OdometryKeyframe, View
 from share.wire.messages import Rate
 
 S = 1_000_000_000
-CANDIDATE = KeyframeCandidate(np.eye(4), np.eye(4), np.eye(6) * 1e-6, np.zeros(3), 0.0, View.empty())
+CANDIDATE = OdometryKeyframe(np.eye(4), np.eye(4), np.eye(6) * 1e-6, np.zeros(3), 0.0, View.empty())
 
 
 def sent(pace: KeyframePace, seconds: float, unacknowledged: int = 0, begin_s: float = 0.0) -> int:

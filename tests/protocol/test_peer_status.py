@@ -8,7 +8,7 @@ from helpers.model_edge import MS, S
 
 from share.config import Config
 from share.protocol.common_events import Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import PeerStatus, RestoredRun
@@ -54,7 +54,7 @@ def test_no_age_is_shown_before_the_first_status() -> None:
 def test_a_restored_run_has_no_age() -> None:
     """The machine has run for long before the edge starts."""
     known = RestoredRun("ann-000b", hello_of("ann", 1), OdometryBase(0, 0, np.eye(4)))
-    edge = Edge(Config(), session=5, restored=[known])
+    edge = EdgeProtocol(Config(), session=5, restored=[known])
     edge.handle(Tick(), 6600 * S)
     seen = shown(edge)
     assert (seen["state"], seen["last_received_s"], seen["gone"]) == ("SILENT", None, True)
@@ -63,14 +63,14 @@ def test_a_restored_run_has_no_age() -> None:
     assert shown(edge)["last_received_s"] == 0.0
 
 
-def edge_with(status: wire.Status, at_ns: int) -> Edge:
-    edge = Edge(Config(), session=5)
+def edge_with(status: wire.Status, at_ns: int) -> EdgeProtocol:
+    edge = EdgeProtocol(Config(), session=5)
     for message in (hello_of("ann", 1), status):
         edge.handle(PeerMessageReceived(wire.peer_id(1), encode(message)), at_ns)
     return edge
 
 
-def shown(edge: Edge) -> dict[str, object]:
+def shown(edge: EdgeProtocol) -> dict[str, object]:
     return edge.report({})["agents"]["ann"]
 
 

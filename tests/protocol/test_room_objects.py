@@ -8,7 +8,7 @@ from helpers.room_bench import Air, RoomBench, at
 
 from share.protocol import room_events as ev
 from share.protocol.common_events import EdgeMessageReceived
-from share.protocol.object_mirror import ObjectMirror
+from share.protocol.object_replica import ObjectReplica
 from share.protocol.room_objects import MAX_OBJECTS, MAX_OWNED
 from share.wire import room_messages as room
 from share.wire.codec import encode
@@ -392,7 +392,7 @@ def test_a_client_that_says_hello_again_and_again_is_not_sent_all_objects_each_t
 
 
 def test_an_edge_of_ever_new_sessions_fills_no_client() -> None:
-    mirror, count = ObjectMirror(), 0
+    mirror, count = ObjectReplica(), 0
     for session in range(20):
         mirror.begin_session(session)
         for _ in range(300):

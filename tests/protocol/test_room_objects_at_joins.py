@@ -33,7 +33,7 @@ def test_an_object_of_either_map_is_where_it_was_placed_after_the_join(seed: int
     for object_id, name in enumerate(("ann", "bob")):
         (run,) = [run for run in machine.room._runs.present() if run.name == name]
         person = town.people[town.peer(name)]
-        T_map_body = run.last_finding.correction.T_map_odom @ person.T_odom_body[-1]
+        T_map_body = run.last_correction_event.correction.T_map_odom @ person.T_odom_body[-1]
         true[object_id] = person.T_world_body[-1] @ AHEAD
         say(room.PutObject(object_id, object_id, ObjectKind.CUBE, run.map_id, T_map_body @ AHEAD))
     placed = {one.object.object_id: one.object.map_id for one in machine.room.kept_objects()}

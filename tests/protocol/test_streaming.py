@@ -15,9 +15,9 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, FailRun, PrintLine, SendToEdge, Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.remote_tracking import TrackingCapacity, TrackingEdge
 from share.protocol.streaming import FrameStreamer, StreamingAgent
 from share.types import F64, Frame, ImuBatch, TrackState
@@ -48,8 +48,8 @@ class Wire:
     now_ms: float = 0.0
     takes: bool = True  # the link
     cut: bool = False
-    agent: Agent = field(default_factory=lambda: StreamingAgent(HELLO, CONFIG))
-    edge: Edge = field(default_factory=lambda: TrackingEdge(CONFIG, 1))
+    agent: AgentProtocol = field(default_factory=lambda: StreamingAgent(HELLO, CONFIG))
+    edge: EdgeProtocol = field(default_factory=lambda: TrackingEdge(CONFIG, 1))
     effects: list[ev.AgentEffect] = field(default_factory=list)
     told: list[dict] = field(default_factory=list)
     trackers: list[ed.StartTracker | ed.StopTracker] = field(default_factory=list)
@@ -262,7 +262,7 @@ def test_the_bye_waits_for_the_last_pose_and_stops_the_tracker() -> None:
 @pytest.mark.parametrize(
     ("edge", "streams", "said"),
     [
-        (Edge(Config(), 1), True, "this edge does not track agents: start it with --policy streamed"),
+        (EdgeProtocol(Config(), 1), True, "this edge does not track agents: start it with --policy streamed"),
         (
             TrackingEdge(CONFIG, 1),
             False,
@@ -270,10 +270,10 @@ def test_the_bye_waits_for_the_last_pose_and_stops_the_tracker() -> None:
         ),
     ],
 )
-def test_an_agent_of_the_other_mode_is_refused(edge: Edge, streams: bool, said: str) -> None:
+def test_an_agent_of_the_other_mode_is_refused(edge: EdgeProtocol, streams: bool, said: str) -> None:
     wire = Wire(
         edge=edge,
-        agent=(StreamingAgent if streams else Agent)(replace(HELLO, streams_frames=streams), CONFIG),
+        agent=(StreamingAgent if streams else AgentProtocol)(replace(HELLO, streams_frames=streams), CONFIG),
     )
     wire.run(200)
     (fail,) = wire.of(FailRun)
@@ -298,7 +298,7 @@ def test_unexpected_messages_change_nothing() -> None:
     wire.to_edge(ed.PeerMessageReceived(m.peer_id(9), encoded(frame(0))))
     report = wire.edge.report({})
     assert report["agents"]["ann"]["unexpected"] == report["unjoined"]["unexpected"] == 1
-    alone = Agent(hello_of("bob", 8), Config())
+    alone = AgentProtocol(hello_of("bob", 8), Config())
     effects = alone.handle(
         EdgeMessageReceived(encoded(m.RemoteTrackingResult(0, 0, TrackState.LOST, None))), 0
     )
@@ -314,7 +314,7 @@ def encoded(message: m.Message) -> list[bytes]:
 # ------------------------------------------------------------------ how many
 
 
-def greeted(edge: Edge, number: int, now_ms: int = 0) -> tuple[list[m.Message], list[ed.EdgeEffect]]:
+def greeted(edge: EdgeProtocol, number: int, now_ms: int = 0) -> tuple[list[m.Message], list[ed.EdgeEffect]]:
     """The answer to the hello of agent `number`, and all effects."""
     hello = replace(hello_of(f"agent{number}", 100 + number), streams_frames=True)
     effects = edge.handle(ed.PeerMessageReceived(m.peer_id(100 + number), encode(hello)), now_ms * MS)

@@ -15,9 +15,9 @@ from share.config import Config, EdgeConfig
 from share.errors import VersionError
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.remote_tracking import TrackingEdge
 from share.protocol.streaming import StreamingAgent
 from share.types import TrackState
@@ -32,8 +32,8 @@ OLD = [version for version in VERSIONS if version < WIRE_VERSION]
 pytestmark = pytest.mark.parametrize("old", OLD)
 
 
-def edges() -> list[Edge]:
-    return [Edge(Config(), 7), TrackingEdge(Config(edge=EdgeConfig(policy="streamed")), 7)]
+def edges() -> list[EdgeProtocol]:
+    return [EdgeProtocol(Config(), 7), TrackingEdge(Config(edge=EdgeConfig(policy="streamed")), 7)]
 
 
 def ups(old: int) -> list[Message]:
@@ -115,7 +115,7 @@ class OlderEdge:
         return [bytes(frame) for frame in encode(pong, self.version)]
 
 
-def run(agent: Agent, edge: OlderEdge | None, seconds: int) -> list[ev.AgentEffect]:
+def run(agent: AgentProtocol, edge: OlderEdge | None, seconds: int) -> list[ev.AgentEffect]:
     """Run at ten frames a second; answers arrive at the next frame."""
     effects = agent.handle(Connected(), 0)
     inbox: list[list[bytes]] = []
@@ -137,7 +137,7 @@ def poses(effects: list[ev.AgentEffect]) -> list[ev.LocalisedPose]:
 
 
 def test_an_agent_finds_that_the_edge_is_older_and_continues(old: int) -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     effects = run(agent, OlderEdge(old), 20)
     (line,) = said(effects)
     assert line.startswith(f"the edge speaks wire {old}, this SHARE ")
@@ -148,11 +148,11 @@ def test_an_agent_finds_that_the_edge_is_older_and_continues(old: int) -> None:
 
 
 def test_an_older_edge_is_found_within_two_seconds(old: int) -> None:
-    assert len(said(run(Agent(HELLO, Config()), OlderEdge(old), 2))) == 1
+    assert len(said(run(AgentProtocol(HELLO, Config()), OlderEdge(old), 2))) == 1
 
 
 def test_an_agent_joins_once_the_edge_is_upgraded(old: int) -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     run(agent, OlderEdge(old), 5)
     welcome = [bytes(f) for f in encode(m.Welcome(8, 0))]
     assert said(agent.handle(EdgeMessageReceived(welcome), 6 * S)) == ["connected to the edge"]
@@ -174,7 +174,7 @@ def test_an_edge_of_this_version_is_not_taken_for_an_older_one(old: int) -> None
 
 
 def test_messages_of_an_older_edge_change_nothing(old: int) -> None:
-    agent = Agent(HELLO, Config())
+    agent = AgentProtocol(HELLO, Config())
     effects = run(agent, None, 5)
     downs = [message for message in traffic(old) if message.way == "down"]
     for message in downs:

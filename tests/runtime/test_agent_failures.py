@@ -17,7 +17,7 @@ from share.odometry.track_result import TrackResult
 from share.runtime import agent, guarded_tracker
 from share.runtime.agent import AgentRun
 from share.runtime.error_estimators import NoErrorEstimate
-from share.types import Frame, ImuBatch, KeyframeCandidate, TrackState, View
+from share.types import Frame, ImuBatch, OdometryKeyframe, TrackState, View
 
 FRAME = Frame(10**9, 0, np.zeros((480, 640), np.uint8), None, None, ImuBatch.empty())
 VIEW = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -40,9 +40,9 @@ class Tracker:
     def track(self, frame: Frame) -> TrackResult:
         return TrackResult(TrackState.OK, np.eye(4), True, 40, True)
 
-    def make_keyframe(self, frame: Frame) -> KeyframeCandidate:
+    def make_keyframe(self, frame: Frame) -> OdometryKeyframe:
         self._do("keyframe")
-        return KeyframeCandidate(np.eye(4), np.eye(4), 1e-6 * np.eye(6), np.zeros(3), 0.01, VIEW, True)
+        return OdometryKeyframe(np.eye(4), np.eye(4), 1e-6 * np.eye(6), np.zeros(3), 0.01, VIEW, True)
 
     def finish_keyframe(self) -> None:
         self._do("settle")

@@ -75,7 +75,7 @@ def test_observers_see_runs_keyframes_decisions_corrections_poses_and_reports(
     (added,) = (one for one in seen.effects if isinstance(one, AddRun))
     assert [one.key for one in seen.effects if isinstance(one, AddKeyframe)] == [added.key] * 4
     assert "agent joined" in {one.fields["event"] for one in seen.effects if isinstance(one, WriteEvent)}
-    assert any(finding.correction for result in seen.results for finding in result.findings)
+    assert any(map_event.correction for result in seen.results for map_event in result.map_events)
     assert seen.poses[added.key].stamp_ns == 7
     assert seen.reports[-1]["agents"]["ann"]["keyframes"] == 4
     assert plan.report()["agents"]["ann"]["position"] is not None

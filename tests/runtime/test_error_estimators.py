@@ -10,11 +10,11 @@ import pytest
 
 from share.odometry.track_result import TrackResult
 from share.runtime.error_estimators import BackgroundErrorModel, SynchronousErrorModel
-from share.types import FeatureStatistics, Frame, KeyframeCandidate, TrackState, View
+from share.types import FeatureStatistics, Frame, OdometryKeyframe, TrackState, View
 
 NOTHING = View(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
 STANDS_ON = FeatureStatistics(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, 0)
-CANDIDATE = KeyframeCandidate(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), 0.0, NOTHING)
+CANDIDATE = OdometryKeyframe(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), 0.0, NOTHING)
 TRACKED, LOST = TrackResult(TrackState.OK, np.eye(4)), TrackResult(TrackState.LOST, None)
 
 

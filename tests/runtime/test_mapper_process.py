@@ -71,6 +71,6 @@ def test_a_failed_keyframe_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -
     for message in (AddRun("ann-1", hello_of("ann", 1)), add("who-1", 0), add("ann-1", 0), END):
         inbox.put(message)
     run_mapper(inbox, answers.append, Config())
-    events = [one.event for found in answers if isinstance(found, MapperResult) for one in found.findings]
+    events = [one.event for found in answers if isinstance(found, MapperResult) for one in found.map_events]
     assert "step failed" in events
     assert len(events) == 2

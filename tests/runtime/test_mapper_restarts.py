@@ -16,7 +16,7 @@ from share.config import Config, EdgeConfig
 from share.errors import StoreError
 from share.mapping.corrections import MapEvent
 from share.net.transport import IncomingMessage
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime.edge import EdgeRun
@@ -139,7 +139,7 @@ def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
 def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
     """A ticket of the earlier map writer would acknowledge what the new one has not written."""
     writers, handled = [], []
-    handle = Edge.handle
+    handle = EdgeProtocol.handle
 
     class Writer(MapWriter):
         """Answers each change once more when its session is over."""
@@ -155,7 +155,7 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
 
     monkeypatch.setattr(edge_module, "MapWriter", Writer)
     monkeypatch.setattr(
-        Edge, "handle", lambda self, event, now: handled.append(event) or handle(self, event, now)
+        EdgeProtocol, "handle", lambda self, event, now: handled.append(event) or handle(self, event, now)
     )
     edge(dies_later)
     until(lambda: len(writers) > 2)
@@ -241,14 +241,14 @@ class BusyLink(Link):
 
 def test_every_message_of_a_burst_is_handled(monkeypatch):
     """The edge dropped each that came after 64 others."""
-    handled, handle = [], Edge.handle
+    handled, handle = [], EdgeProtocol.handle
 
     def noting(self, event, now):
         if isinstance(event, PeerMessageReceived):
             handled.append(event.peer_id[0])
         return handle(self, event, now)
 
-    monkeypatch.setattr(Edge, "handle", noting)
+    monkeypatch.setattr(EdgeProtocol, "handle", noting)
     run = EdgeRun(Config(), BusyLink(), None, lambda fields: None)
     thread = threading.Thread(target=run.run)
     thread.start()
@@ -340,7 +340,7 @@ def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
     until(run.report)
     monkeypatch.setattr(edge_module, "_STALE_REPORT_S", 0.2)
     with monkeypatch.context() as patch:
-        patch.setattr(Edge, "report", lambda self, mapper: {}["none"])
+        patch.setattr(EdgeProtocol, "report", lambda self, mapper: {}["none"])
         until(lambda: any("stuck" in line for line in run.report()["trouble"]))
         assert [line["event"] for line in events].count("internal error") == 1
     until(lambda: not any("stuck" in line for line in run.report()["trouble"]))

@@ -23,9 +23,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
 from share.errors import TransportError, UsageError
-from share.mapping.agents.agreement import AgentStanding
+from share.mapping.agents.agreement import AgentConsistency
 from share.mapping.mapper import Mapper
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import AddRun, PeerMessageReceived
 from share.runtime import edge_metrics, web
 from share.runtime.status_server import CACHE_S, StatusServer
@@ -91,7 +91,7 @@ def metrics(body):
 
 def real_report():
     """Return the report of an edge that knows one agent and nothing more."""
-    edge, mapper = Edge(Config(), session=5), Mapper(Config())
+    edge, mapper = EdgeProtocol(Config(), session=5), Mapper(Config())
     hello = hello_of("ann", 1)
     for effect in edge.handle(PeerMessageReceived(peer_id(1), encode(hello)), 10**9):
         if isinstance(effect, AddRun):
@@ -123,7 +123,7 @@ def test_health_lists_present_agents():
 
 def test_a_peers_bad_messages_do_not_make_the_edge_unhealthy():
     """Whoever restarts an edge because of that would do the attacker's work."""
-    edge = Edge(Config(), session=5)
+    edge = EdgeProtocol(Config(), session=5)
     for k in range(100):
         edge.handle(PeerMessageReceived(peer_id(1), [b"nonsense"]), 10**9)
         edge.handle(PeerMessageReceived(peer_id(2), encode(hello_of("ann", 2))), 10**9 + k)
@@ -286,13 +286,13 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_the_page_shows_the_consistency_of_agents():
     """Each field that the page reads is one of the report's."""
-    reported = asdict(AgentStanding("set apart", "against ann its depths are larger", 0.03, 0.002))
+    reported = asdict(AgentConsistency("quarantined", "against ann its depths are larger", 0.03, 0.002))
     with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": reported}}}) as server:
         assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == reported
         page = get(server, "/")[2].decode()
-    assert 'id="consistency"' in page and '["set apart", "disputed"].includes' in page
+    assert 'id="consistency"' in page and '["quarantined", "disputed"].includes' in page
     assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= reported.keys()
-    assert {"reason", "log_scale", "sigma", "put_right"} <= set(re.findall(r"\bc\.(\w+)", page))
+    assert {"reason", "log_scale", "sigma", "corrected_log_scale"} <= set(re.findall(r"\bc\.(\w+)", page))
 
 
 def test_the_page_shows_objects_robots_and_clients():

@@ -12,7 +12,7 @@ from helpers.stepwise_allocation import StepwiseAllocation
 
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
-from share.scheduling.room_budget import FREE_WAIT_MS, AgentAir, RoomBudget
+from share.scheduling.room_budget import FREE_WAIT_MS, AgentDemand, RoomBudget
 from share.types import AgentKind
 
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
@@ -27,7 +27,7 @@ def random_room(rng: np.random.Generator, count: int) -> RoomBudget:
     for k in range(count):
         terms = TERMS[ROBOT if rng.random() < robots else AR]
         own_ms = keyframe_ms * rng.uniform(0.5, 2.0)
-        agents[f"a{k}"] = AgentAir(
+        agents[f"a{k}"] = AgentDemand(
             terms=replace(terms, signed=bool(rng.random() < 0.1)),
             wanted_hz=rng.uniform(0.1, 5.0),
             keyframe_s=own_ms / 1e3,
@@ -77,7 +77,7 @@ def cpu_s(work: Callable[[], object]) -> float:
 
 def test_it_takes_a_tenth_of_the_time_of_the_plainest_way() -> None:
     """32 agents on air that is just short, where steps are most."""
-    one = AgentAir(TERMS[AR], 5.0, 0.005, 0.001, 65.0, 1.5, 1.0, hz=1.0, pose_hz=5.0, updated_ns=0)
+    one = AgentDemand(TERMS[AR], 5.0, 0.005, 0.001, 65.0, 1.5, 1.0, hz=1.0, pose_hz=5.0, updated_ns=0)
     room = RoomBudget({f"a{k}": replace(one, drift_cm=0.5 + k / 64) for k in range(32)})
     plainest = StepwiseAllocation(room, {})
     assert 1.0 < np.mean([grant.hz for grant in room.allocate()[0].values()]) < 5.0

@@ -15,13 +15,13 @@ from share.scheduling.qoe import QoeParameters, QoeTable, qoe
 from share.scheduling.room_budget import (
     LEAST_HZ,
     SCARCE_POSE_HZ,
-    AgentAir,
+    AgentDemand,
     RateGrant,
     RoomBudget,
     first_grant,
     message_s,
 )
-from share.scheduling.room_controller import MeasuredAir, RoomController
+from share.scheduling.room_controller import AirtimeMeasurement, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -30,20 +30,20 @@ AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
 TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in (AR, ROBOT)}
 
 
-def agent(kind: AgentKind = AR, keyframe_ms: float = 40.0, **given: float) -> AgentAir:
+def agent(kind: AgentKind = AR, keyframe_ms: float = 40.0, **given: float) -> AgentDemand:
     fields = {"wanted_hz": 1.5, "delay_ms": 60 + keyframe_ms, "error_cm": 1.5, "drift_cm": 1.0} | given
     rates = {"hz": 1.0, "pose_hz": 30.0, "updated_ns": 0}
     air = {"keyframe_s": keyframe_ms / 1e3, "arrival_s": max(0.0, keyframe_ms - AT_ONCE_MS) / 1e3}
-    return AgentAir(terms=TERMS[kind], **(rates | air | fields))  # type: ignore[arg-type]
+    return AgentDemand(terms=TERMS[kind], **(rates | air | fields))  # type: ignore[arg-type]
 
 
-def room(*agents: AgentAir) -> RoomBudget:
+def room(*agents: AgentDemand) -> RoomBudget:
     return RoomBudget({f"a{k}": one for k, one in enumerate(agents)})
 
 
 def test_an_agent_whose_air_is_not_known_starts_slowly() -> None:
     told = Evaluation(0, 20.0, 1.0)
-    airs = [MeasuredAir(0.0, 0.0, n, 0) for n in range(3)]
+    airs = [AirtimeMeasurement(0.0, 0.0, n, 0) for n in range(3)]
     grants = [RoomController().grant("a0", TERMS[AR], 5.0, told, air, S) for air in airs]
     assert grants == [first_grant(AR), first_grant(AR), RateGrant(5.0)]
 
@@ -91,7 +91,7 @@ def test_time_on_the_air_follows_from_what_is_measured_at_any_load() -> None:
     for load in (0.1, 0.5, 0.9):
         messages = agent(pose_hz=5.0).messages_hz * message_s(0.04)
         measured = agent(keyframe_ms=40 / (1 - load), hz=(load - messages) / 0.04, pose_hz=5.0)
-        assert room(measured).air_s(measured) == pytest.approx(0.04)
+        assert room(measured).airtime_s(measured) == pytest.approx(0.04)
         assert room(measured).load == pytest.approx(load)
 
 
@@ -109,7 +109,7 @@ def test_an_agent_that_claims_to_take_no_air_gains_little_and_delays_nobody(hone
     liar = replace(others[0], keyframe_s=0.0, delay_ms=60.0, error_cm=5.0, drift_cm=5.0)
     usual, granted = room(*others, others[0]).allocate()[0], room(*others, liar).allocate()[0]
     assert granted[f"a{honest}"].hz <= 6 * granted["a0"].hz
-    alone_s = room(*others).air_s(others[0])
+    alone_s = room(*others).airtime_s(others[0])
 
     def load(grants: dict[str, RateGrant]) -> float:
         return sum(alone_s * g.hz + (SCARCE_POSE_HZ[AR] + 8) * message_s(alone_s) for g in grants.values())
@@ -121,9 +121,9 @@ def test_an_agent_has_a_faster_link_if_the_edge_sees_it() -> None:
     others = [agent()] * 3
     fast, claims = agent(keyframe_ms=8.0), agent(keyframe_ms=0.0, arrival_s=0.036)
     budget = room(*others, fast, claims)
-    own, claimed = (budget.air_s(budget.agents[name]) for name in ("a3", "a4"))
-    assert claimed == pytest.approx(budget.usual_air_s)
-    assert budget.usual_air_s is not None and 0.2 < own / budget.usual_air_s < 0.25
+    own, claimed = (budget.airtime_s(budget.agents[name]) for name in ("a3", "a4"))
+    assert claimed == pytest.approx(budget.median_airtime_s)
+    assert budget.median_airtime_s is not None and 0.2 < own / budget.median_airtime_s < 0.25
 
 
 def test_more_goes_to_whom_it_gains_more() -> None:
@@ -185,7 +185,7 @@ agents = st.builds(
 
 
 @given(st.lists(agents, min_size=1, max_size=6))
-def test_no_report_breaks_it(reported: list[AgentAir]) -> None:
+def test_no_report_breaks_it(reported: list[AgentDemand]) -> None:
     budget = room(*reported)
     assert budget.is_short() in (True, False)
     for name, grant in budget.allocate()[0].items():

@@ -9,9 +9,9 @@ from helpers.modelled_air import AT_ONCE_MS
 
 from share.config import ControlConfig
 from share.scheduling.qoe import QoeParameters
-from share.scheduling.room_budget import AgentAir, RoomBudget
+from share.scheduling.room_budget import AgentDemand, RoomBudget
 from share.scheduling.room_capacity import TOLERATED_AIR_MS, RoomCapacity, crowded_air_ms
-from share.scheduling.room_controller import MeasuredAir, RoomController
+from share.scheduling.room_controller import AirtimeMeasurement, RoomController
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -22,10 +22,10 @@ KEYFRAME_MS = 54.0  # at 5 Mbit/s
 
 
 def room(headsets: int, robots: int, keyframe_ms: float = KEYFRAME_MS, other_ms: float = 60.0) -> RoomBudget:
-    def agent(kind: AgentKind) -> AgentAir:
+    def agent(kind: AgentKind) -> AgentDemand:
         times = {"keyframe_s": keyframe_ms / 1e3, "arrival_s": (keyframe_ms - AT_ONCE_MS) / 1e3}
         times["delay_ms"] = other_ms + keyframe_ms
-        return AgentAir(
+        return AgentDemand(
             TERMS[kind], wanted_hz=1.5, error_cm=1.0, drift_cm=0.5, hz=0.0, pose_hz=0.0, updated_ns=0, **times
         )
 
@@ -90,7 +90,7 @@ def test_robots_alone_refuse_no_robot() -> None:
 def test_a_room_that_all_have_left_is_not_full(gone_s: float) -> None:
     controller, told = RoomController(), Evaluation(0, 1050.0, 1.0, 10.0, 5.0, 800.0, 0.5)
     for k in range(400):
-        air = MeasuredAir(800.0, 796.0, 9 + k // 40, k)
+        air = AirtimeMeasurement(800.0, 796.0, 9 + k // 40, k)
         controller.grant(f"a{k % 20}", TERMS[AR], 1.5, told, air, k * S // 20)
     assert controller.objection(AR, 20 * S) is not None
     if gone_s < 3:

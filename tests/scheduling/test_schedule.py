@@ -11,7 +11,7 @@ from helpers.hellos import hello_of, rig_of
 from share.config import Config, ControlConfig, EdgeConfig
 from share.geometry import se3
 from share.protocol import edge_events as ed
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.scheduling.merge_gate import MergeGate
 from share.scheduling.policies import POLICIES, AgentReport
 from share.scheduling.qoe import QoeParameters, qoe
@@ -26,13 +26,13 @@ MS = 1_000_000
 CONTROL = ControlConfig(ar_target=0.8)
 
 
-def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> Edge:
-    edge = Edge(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
+def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> EdgeProtocol:
+    edge = EdgeProtocol(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
     edge.handle(ed.PeerMessageReceived(b"a", encode(hello_of("ann", 5, kind))), 0)
     return edge
 
 
-def rates(edge: Edge, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
+def rates(edge: EdgeProtocol, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
     told = encode(m.Evaluation(0, delay_ms, error_cm, rtt_ms=delay_ms))
     effects = edge.handle(ed.PeerMessageReceived(b"a", told), now_ms * MS)
     said = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]

@@ -109,7 +109,9 @@ def test_the_outline_continues_all_runs_as_the_whole_map_does(path: Path, has_po
         (one.key, one.next_keyframe, one.credential) for one in after
     ]
     for one, other in zip(before, after, strict=True):
-        first, second = (found and found.correction for found in (one.last_finding, other.last_finding))
+        first, second = (
+            found and found.correction for found in (one.last_correction_event, other.last_correction_event)
+        )
         assert (first is None) == (second is None)
         if first is not None and second is not None:
             assert first.map_id == second.map_id

@@ -21,10 +21,10 @@ SEEDS = range(1, 11)
 COSTS = 1.10  # what a lie may cost the others, as a part of their error: of all rooms together
 LIES = {  # and what is said of it
     "scale 0.99 sure 10": "agrees",
-    "scale 1.02 sure 10": "set apart",
-    "scale 0.97 sure 100": "set apart",
-    "way 1.05 sure 10": "set apart",
-    "camera 5 deg sure 10": "set apart",
+    "scale 1.02 sure 10": "quarantined",
+    "scale 0.97 sure 100": "quarantined",
+    "way 1.05 sure 10": "quarantined",
+    "camera 5 deg sure 10": "quarantined",
     "sure 10": "agrees",
 }
 
@@ -133,7 +133,7 @@ def test_consistent_agents_are_never_quarantined(tool, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(("lie", "is_said"), LIES.items())
 def test_false_claims_cost_other_agents_little(tool, lie, is_said):
-    """Compared with the same rooms without the agent, which helps no other when set apart. An agent that is
+    """Compared with the same rooms without the agent, which helps no other when quarantined. An agent that is
     let in has to help as much as one with the same wrong covariance and no other fault."""
     reported = [played(tool, seed, tool.LIES[lie]) for seed in SEEDS]
     without = [alone(tool, seed) for seed in SEEDS]
@@ -159,10 +159,10 @@ def test_overconfident_noise_separates_no_agents(tool):
 
 @pytest.mark.long
 def test_false_claim_is_detected_before_it_moves_other_agents(tool):
-    """The others join at the fifth second, as without the agent, which is set apart by then."""
+    """The others join at the fifth second, as without the agent, which is quarantined by then."""
     short, config = room(1, 21), tool.configured(['edge.policy="covins-g"'])
     outcome = tool.played(short, tool.LIES["scale 0.97 sure 100"], config)
-    assert outcome.liar == "set apart"
+    assert outcome.liar == "quarantined"
     assert not outcome.wronged
     assert outcome.together is not None
     assert outcome.final <= COSTS * tool.played(short, None, config).final

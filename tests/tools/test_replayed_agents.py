@@ -12,18 +12,18 @@ from helpers.hellos import hello_of
 
 from share.earlier_poses import EarlierPoses
 from share.lab.evaluate.simulation import TrackedFrame
-from share.types import AgentKind, KeyframeCandidate, View
+from share.types import AgentKind, OdometryKeyframe, View
 
 TOOLS = Path(__file__).parents[2] / "tools" / "experiments"
 PERIOD_NS, COUNT = 10**8, 20
 COV = np.diag([1e-6] * 6)
 
 
-def candidate(k: int) -> KeyframeCandidate:
+def candidate(k: int) -> OdometryKeyframe:
     T = np.eye(4)
     T[0, 3] = 0.1 * k
     earlier = EarlierPoses(np.array([(k - 4) * PERIOD_NS]), np.eye(4)[None], COV[None])
-    return KeyframeCandidate(T, np.eye(4), COV, np.array([0.0, 0, 1]), 0.01, View.empty(), earlier=earlier)
+    return OdometryKeyframe(T, np.eye(4), COV, np.array([0.0, 0, 1]), 0.01, View.empty(), earlier=earlier)
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ from share.mapping.mapper import Mapper
 from share.mapping.steps import SolveStep
 from share.protocol import edge_events as ed
 from share.protocol.common_events import Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.types import F64, AgentKind, Keyframe, KeyframeImage, View
 from share.vision import corners
 from share.vision.keyframe_images import compress
@@ -61,7 +61,7 @@ class InnerEdge:
 
     def __init__(self, max_keyframes: int = 300) -> None:
         config = Config(edge=EdgeConfig(max_keyframes=max_keyframes))
-        self.edge, self.mapper, self.solver = Edge(config, 7), Mapper(config), PoseGraphSolver()
+        self.edge, self.mapper, self.solver = EdgeProtocol(config, 7), Mapper(config), PoseGraphSolver()
         self.keys: dict[str, str] = {}
         self.raised: list[Raised] = []
         self.cpu_ms: dict[str, tuple[float, int]] = defaultdict(lambda: (0.0, -1))
@@ -136,10 +136,10 @@ class InnerEdge:
                     if fields["event"] == "internal error":
                         self.raised.append(Raised("edge", str(fields["reason"]), False))
 
-    def _found(self, findings: list[MapEvent]) -> None:
-        self.events["step failed"] += sum(finding.event == "step failed" for finding in findings)
+    def _found(self, map_events: list[MapEvent]) -> None:
+        self.events["step failed"] += sum(map_event.event == "step failed" for map_event in map_events)
         changes, empty = self.mapper.take_changes(), self.mapper.take_empty_runs()
-        self._carry_out(self.edge.handle(ed.MapperResult(tuple(findings), changes, empty), self.now_ns))
+        self._carry_out(self.edge.handle(ed.MapperResult(tuple(map_events), changes, empty), self.now_ns))
 
     def _timed(self, call: str, work: Callable[[], T], default: T) -> T:
         before = time.thread_time()

@@ -16,7 +16,7 @@ from share.view import drawing as dr
 from share.view import events as ev
 from share.view import loop_views
 from share.view.loop_views import KeyframePictures, nearest_to_ray
-from share.view.room import Room
+from share.view.room import DrawnRoom
 from share.view.viewer import Viewer
 
 
@@ -38,9 +38,9 @@ def keyframe(name: str, id_: int, x: float, shade: int) -> ev.KeyframeArrived:
 
 
 @pytest.fixture
-def room() -> Room:
+def room() -> DrawnRoom:
     """Ann's keyframes at x = 0 and 4, bob's at 0.5 and 4.5, and a loop of each pair."""
-    room = Room()
+    room = DrawnRoom()
     for name, x, shades in (("ann", 0.0, (20, 60)), ("bob", 0.5, (120, 200))):
         room.apply(ev.RunArrived(f"{name}-1", name, AgentKind.AR, np.eye(4), (0.8, 0.6)), 0.0)
         room.apply(keyframe(name, 0, x, shades[0]), 0.0)
@@ -55,7 +55,7 @@ ABOVE = np.array([0.25, 0.0, 5.0])
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-def test_a_click_shows_both_views_of_the_loop_that_it_meets(room: Room) -> None:
+def test_a_click_shows_both_views_of_the_loop_that_it_meets(room: DrawnRoom) -> None:
     for x, titles, shades in (
         (0.25, ("ann, keyframe 0", "bob, keyframe 0"), (20, 120)),
         (4.25, ("ann, keyframe 1", "bob, keyframe 1"), (60, 200)),
@@ -66,12 +66,12 @@ def test_a_click_shows_both_views_of_the_loop_that_it_meets(room: Room) -> None:
             assert shade_of(data) == (pytest.approx(shade, abs=2), (240, 320))
 
 
-def test_a_click_beside_all_loops_shows_nothing(room: Room) -> None:
+def test_a_click_beside_all_loops_shows_nothing(room: DrawnRoom) -> None:
     assert room.loop_at(ABOVE, np.array([0.0, 1.0, 0.0])) is None
-    assert Room().loop_at(ABOVE, DOWN) is None
+    assert DrawnRoom().loop_at(ABOVE, DOWN) is None
 
 
-def test_loops_have_marks_to_click_until_they_are_removed(room: Room) -> None:
+def test_loops_have_marks_to_click_until_they_are_removed(room: DrawnRoom) -> None:
     (marks,) = [one for one in room.take_drawings(0.0) if isinstance(one, dr.Marks)]
     assert np.allclose(marks.positions[:, 0], [0.25, 4.25])
     room.apply(ev.LoopsRemoved(KeyframeKey("ann-1", 0), KeyframeKey("bob-1", 0)), 0.0)
@@ -81,7 +81,7 @@ def test_loops_have_marks_to_click_until_they_are_removed(room: Room) -> None:
     assert dr.Removed(marks.name) in room.take_drawings(0.0)
 
 
-def test_a_picture_that_is_gone_is_said_to_be(room: Room) -> None:
+def test_a_picture_that_is_gone_is_said_to_be(room: DrawnRoom) -> None:
     room.apply(ev.KeyframesRemoved((KeyframeKey("ann-1", 0),)), 0.0)
     assert room.loop_at(ABOVE, DOWN) is None  # with its loop
 
@@ -128,7 +128,7 @@ class Page:
     def show_panel(self, html: str, agents: Any) -> None: ...
 
 
-def test_a_click_is_answered_in_its_browser_alone(room: Room) -> None:
+def test_a_click_is_answered_in_its_browser_alone(room: DrawnRoom) -> None:
     clicks = (SimpleNamespace(browser=7, origin=ABOVE, direction=DOWN),)
     page = Page(*clicks, SimpleNamespace(browser=8, origin=ABOVE, direction=-DOWN))
     viewer = Viewer(None, page)  # type: ignore[arg-type]

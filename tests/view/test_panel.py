@@ -10,7 +10,7 @@ import numpy as np
 from share.types import AgentKind, TrackState
 from share.view import events as ev
 from share.view.panel import SidePanel, sparkline
-from share.view.room import LastCorrection, Room
+from share.view.room import DrawnRoom, LastCorrection
 
 AGENT: dict[str, Any] = {
     "run": "ann-1",
@@ -30,7 +30,7 @@ AGENT: dict[str, Any] = {
 
 
 def panel_of(*events: ev.RoomEvent, now_s: float = 10.0) -> str:
-    room, panel = Room(), SidePanel()
+    room, panel = DrawnRoom(), SidePanel()
     for event in (ev.RunArrived("ann-1", "ann", AgentKind.AR, np.eye(4), (0.8, 0.6)), *events):
         panel.apply(event)
         room.apply(event, 0.0)

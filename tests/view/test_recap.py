@@ -10,7 +10,7 @@ from share.types import AgentKind
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.events import MAX_KEYFRAMES, Recap
-from share.view.room import Room
+from share.view.room import DrawnRoom
 
 
 def at(x: float) -> np.ndarray:
@@ -24,7 +24,7 @@ def shown(run: str, k: int) -> ev.KeyframeArrived:
 
 
 def drawn(events: list[ev.RoomEvent]) -> dict[str, object]:
-    room, out = Room(), dict[str, object]()
+    room, out = DrawnRoom(), dict[str, object]()
     for event in events:
         room.apply(event, 0.0)
     while room.waiting:

@@ -13,7 +13,7 @@ from share.types import F64, AgentKind, TrackState
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import KEYFRAMES_PER_CHUNK, PATH_POINTS_PER_CHUNK
-from share.view.room import Room
+from share.view.room import DrawnRoom
 
 POINTS = np.random.default_rng(1).uniform(1, 3, (20, 3)).astype(np.float32)
 
@@ -47,7 +47,7 @@ def solved(*entries: tuple[str, int, str, F64]) -> ev.MapsSolved:
     )
 
 
-def told(room: Room, *events: ev.RoomEvent, now_s: float = 0.0) -> list[dr.Drawing]:
+def told(room: DrawnRoom, *events: ev.RoomEvent, now_s: float = 0.0) -> list[dr.Drawing]:
     for event in events:
         room.apply(event, now_s)
     return room.take_drawings(now_s)
@@ -74,7 +74,7 @@ def positions(drawing: dr.Drawing) -> F64:
 
 
 def test_a_keyframe_is_drawn_once_its_place_is_known() -> None:
-    room = Room()
+    room = DrawnRoom()
     assert not of(told(room, run("ann"), keyframe("ann", 0, 1.0, begins=True)), "/points")
     drawings = told(room, corrected("ann", "A", at(10.0)))
     (points,) = of(drawings, "/points/0/0")
@@ -84,20 +84,20 @@ def test_a_keyframe_is_drawn_once_its_place_is_known() -> None:
 
 
 def test_nothing_is_drawn_where_nothing_changed() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent())
     assert told(room) == [] and room.waiting == 0
     assert told(room, solved(("ann", 0, "A", at(0.001)))) == []  # nobody sees a millimetre
 
 
 def test_only_the_chunk_of_a_new_keyframe_is_drawn_again() -> None:
-    room, count = Room(), KEYFRAMES_PER_CHUNK + 2
+    room, count = DrawnRoom(), KEYFRAMES_PER_CHUNK + 2
     told(room, *one_agent(), *(keyframe("ann", k, 0.1 * k) for k in range(1, count)))
     assert names(of(told(room, keyframe("ann", count, 9.0)), "/points")) == {"/points/0/1"}
 
 
 def test_a_solution_moves_what_has_moved() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), *(keyframe("ann", k, 0.1 * k) for k in range(1, KEYFRAMES_PER_CHUNK + 1)))
     moved = told(room, solved(("ann", 0, "A", at(0.0)), ("ann", KEYFRAMES_PER_CHUNK, "A", at(5.0))))
     (points,) = of(moved, "/points")
@@ -106,7 +106,7 @@ def test_a_solution_moves_what_has_moved() -> None:
 
 def test_so_many_chunks_are_drawn_at_a_time() -> None:
     """A large map is no burst: the rest comes with the next pictures."""
-    room, count = Room(), 40 * KEYFRAMES_PER_CHUNK
+    room, count = DrawnRoom(), 40 * KEYFRAMES_PER_CHUNK
     drawn = told(room, *one_agent(), *(keyframe("ann", k, 0.01 * k) for k in range(1, count)))
     assert 0 < len(of(drawn, "/points")) < 10 and room.waiting > 60
     seen = names(of(drawn, "/points"))
@@ -116,7 +116,7 @@ def test_so_many_chunks_are_drawn_at_a_time() -> None:
 
 
 def test_removed_keyframes_are_gone_and_their_path_stays() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), keyframe("ann", 1, 1.0))
     told(room, *(pose("ann", 1, 0.1 * k) for k in range(5)))
     before = positions(of(told(room, solved(("ann", 1, "A", at(1.5)))), "/paths")[0])
@@ -131,7 +131,7 @@ def test_removed_keyframes_are_gone_and_their_path_stays() -> None:
 
 
 def test_an_agent_is_where_its_newest_pose_is() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), keyframe("ann", 1, 1.0))
     (body,) = of(told(room, pose("ann", 1, 0.5)), "/agents")
     assert isinstance(body, dr.Body) and body.is_current and body.label == "ann"
@@ -143,14 +143,14 @@ def test_an_agent_is_where_its_newest_pose_is() -> None:
 
 @pytest.mark.parametrize("entry", [{"state": "SILENT", "gone": False}, {"state": "OK", "gone": True}])
 def test_an_agent_that_is_not_heard_is_shown_so(entry: dict[str, object]) -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), pose("ann", 0, 0.5))
     (body,) = of(told(room, ev.AgentsReported({"ann": {"run": "ann-1", **entry}})), "/agents")
     assert isinstance(body, dr.Body) and not body.is_current
 
 
 def test_its_newest_picture_is_shown_once() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent())
     drawings = told(
         room, keyframe("ann", 1, 1.0, jpeg=b"one"), keyframe("ann", 2, 2.0, jpeg=b"two"), pose("ann", 2, 0.0)
@@ -160,7 +160,7 @@ def test_its_newest_picture_is_shown_once() -> None:
 
 
 def test_a_path_grows_by_chunks_that_are_joined() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent())
     for k in range(PATH_POINTS_PER_CHUNK + 30):
         room.apply(pose("ann", 0, 0.05 * k), 0.0)
@@ -171,7 +171,7 @@ def test_a_path_grows_by_chunks_that_are_joined() -> None:
 
 
 def test_a_path_is_bounded() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent())
     for k in range(403 * PATH_POINTS_PER_CHUNK):
         room.apply(pose("ann", 0, 0.05 * k), 0.0)
@@ -179,7 +179,7 @@ def test_a_path_is_bounded() -> None:
 
 
 def test_agents_have_a_colour_each_which_a_new_run_keeps() -> None:
-    room = Room()
+    room = DrawnRoom()
     again = ev.RunArrived("ann-2", "ann", AgentKind.AR, np.eye(4), (1.0, 1.0))
     told(room, run("ann"), run("bob"), again)
     ann, bob, ann_again = (room.colour(one) for one in room.runs.values())
@@ -189,8 +189,8 @@ def test_agents_have_a_colour_each_which_a_new_run_keeps() -> None:
 # ---------------------------------------------------------------- maps
 
 
-def two_maps() -> Room:
-    room = Room()
+def two_maps() -> DrawnRoom:
+    room = DrawnRoom()
     told(room, *one_agent("ann", "A"), *one_agent("bob", "B"), pose("ann", 0, 0.0), pose("bob", 0, 0.0))
     return room
 
@@ -216,7 +216,7 @@ def test_a_map_without_a_keyframe_gives_its_place_up() -> None:
 
 def test_an_event_of_a_long_session_costs_no_more(soon: None) -> None:
     """600 runs took 9 s, 4,000 keyframes with removals 104 s."""
-    room = Room()
+    room = DrawnRoom()
     for k in range(600):
         told(room, *one_agent(f"a{k}", f"m{k}"), pose(f"a{k}", 0, 0.0))
     rng = np.random.default_rng(1)
@@ -268,7 +268,7 @@ def floors(drawings: Iterable[dr.Drawing]) -> list[dr.FloorGrid]:
 
 
 def test_the_floor_is_as_wide_as_the_maps() -> None:
-    room = Room()
+    room = DrawnRoom()
     (first,) = floors(told(room, *one_agent("ann", "A")))
     assert not floors(told(room, keyframe("ann", 1, 0.0)))
     (wide,) = floors(told(room, *one_agent("bob", "B")))  # another map, beside it
@@ -286,7 +286,7 @@ def test_the_last_map_stands_at_the_origin() -> None:
 
 
 def test_keyframes_of_a_new_segment_wait_for_its_place() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), keyframe("ann", 1, 1.0))
     assert not of(told(room, keyframe("ann", 2, 50.0, begins=True)), "/points")
     told(room, corrected("ann", "A", at(7.0), segment_keyframe=1))  # a late one, of the segment before
@@ -317,7 +317,7 @@ def test_loops_follow_their_keyframes_and_go_with_them() -> None:
 
 
 def test_a_correction_is_marked_where_it_is_seen() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), pose("ann", -1, 1.0))
     assert not of(told(room, corrected("ann", "A", at(0.001)), now_s=1.0), "/corrections")
     (mark,) = of(told(room, corrected("ann", "A", at(0.5)), now_s=2.0), "/corrections")
@@ -330,7 +330,7 @@ def test_a_correction_is_marked_where_it_is_seen() -> None:
 
 
 def test_a_new_session_removes_what_was_drawn() -> None:
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), keyframe("ann", 1, 1.0), pose("ann", 1, 0.0), pose("ann", 1, 1.0))
     told(room)
     gone = told(room, ev.SessionBegun())
@@ -368,7 +368,7 @@ def test_a_forgotten_run_is_removed() -> None:
 )
 def test_what_was_dropped_before_does_no_harm(event: ev.RoomEvent) -> None:
     """The feed drops its oldest entries, so any event may concern something unknown."""
-    room = Room()
+    room = DrawnRoom()
     told(room, *one_agent(), event, keyframe("ann", 1, 1.0))
     assert len(room.runs["ann-1"].keyframes) == 2
 

@@ -82,11 +82,13 @@ def test_points_are_those_that_are_near_and_certain_in_the_body() -> None:
 def test_what_the_mapper_decides_is_told() -> None:
     loop = mc.loop(1, 2)
     changes = (SaveLoop(loop), RemoveLoops(loop.a, loop.b), RemoveKeyframes((loop.a,)))
-    findings = (
+    map_events = (
         map_assignment(KEY, "ann-0001/0", mc.pose(2), 0),
         MapEvent(KEY, "loop refused", "few inliers"),
     )
-    added, removed, keyframes, corrected = told(lambda feed: feed.add_result(MapperResult(findings, changes)))
+    added, removed, keyframes, corrected = told(
+        lambda feed: feed.add_result(MapperResult(map_events, changes))
+    )
     assert added == ev.LoopAccepted(loop.a, loop.b) and removed == ev.LoopsRemoved(loop.a, loop.b)
     assert keyframes == ev.KeyframesRemoved((loop.a,))
     assert isinstance(corrected, ev.CorrectionArrived) and corrected.map_id == "ann-0001/0"

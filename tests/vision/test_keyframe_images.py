@@ -18,8 +18,8 @@ from share.types import (
     MAX_PLANE,
     MAX_SURFACES,
     MAX_UV,
-    KeyframeCandidate,
     KeyframeImage,
+    OdometryKeyframe,
     View,
 )
 from share.vision.image_codec import encode_jpeg, encode_png
@@ -113,7 +113,7 @@ def test_points_lie_on_their_planes() -> None:
 def test_a_candidates_points_are_those_of_its_features_and_surfaces() -> None:
     view = View([[0.0, 0.0]], [[0.0, 0.0, 2.0]], np.zeros((1, 32), np.uint8))
     eye, image = np.eye(4), image_of(1, uv=[[0.0, 0.0]], plane=[[0.0, 0.0, 0.25]])
-    candidate = KeyframeCandidate(eye, eye, np.zeros((6, 6)), np.zeros(3), 0.0, view, image=image)
+    candidate = OdometryKeyframe(eye, eye, np.zeros((6, 6)), np.zeros(3), 0.0, view, image=image)
     assert candidate.points[:, 2].tolist() == [2.0, 4.0]
 
 

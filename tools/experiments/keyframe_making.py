@@ -25,7 +25,7 @@ from share.lab.pool import Pool
 from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
 from share.sensors.measurement import CAM0, CAM1, DEPTH
-from share.types import F64, I64, Frame, Keyframe, KeyframeCandidate, KeyframeImage, View
+from share.types import F64, I64, Frame, Keyframe, KeyframeImage, OdometryKeyframe, View
 from share.wire.messages import Hello
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
@@ -117,7 +117,7 @@ def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[KeyframeImag
     for T, T_last, step, stamp_ns, image in zip(
         T_odom_body, T_last_body, cov, stamps_ns.tolist(), seen, strict=True
     ):
-        candidate = KeyframeCandidate(T, T_last, step, T[2, :3], Drift().tilt_rad, View.empty(), image=image)
+        candidate = OdometryKeyframe(T, T_last, step, T[2, :3], Drift().tilt_rad, View.empty(), image=image)
         chain.extend(candidate)
         out.append(chain.make_keyframe(candidate, stamp_ns))
     return tuple(out)

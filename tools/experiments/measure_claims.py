@@ -41,7 +41,7 @@ from share.lab.evaluate.emulated_network import NETWORK_PRESETS  # noqa: E402
 from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
 from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
 from share.mapping.mapper import Mapper  # noqa: E402
-from share.types import F64, KeyframeCandidate, View  # noqa: E402
+from share.types import F64, OdometryKeyframe, View  # noqa: E402
 from share.wire.messages import Hello, peer_id  # noqa: E402
 
 
@@ -121,7 +121,7 @@ def claimed_runs(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[Trac
             view = View(view.uv, view.points * np.float32(now.depth), view.descriptors)
             image = replace(image, plane=image.plane / np.float32(now.depth))
         cov = keyframe.cov / now.sure**2
-        candidate = KeyframeCandidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins, image)
+        candidate = OdometryKeyframe(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins, image)
         runs[-1].append(TrackedFrame(keyframe.stamp_ns, T_odom, candidate=candidate))
     hello = _turned(agent.hello, lie.turn_deg)
     return [(replace(hello, run_id=(hello.run_id + n) % 2**64), seen) for n, seen in enumerate(runs)]

@@ -18,7 +18,7 @@ from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.evaluate.virtual_time import track_agent
 from share.recordings.session import Session
 from share.runtime.source import open_source
-from share.types import AgentKind, KeyframeCandidate
+from share.types import AgentKind, OdometryKeyframe
 from share.vision.keyframe_images import Surfaces, decompress
 from share.wire.messages import Hello
 
@@ -72,7 +72,7 @@ class ReplayedAgent:
                 frame, arrival_ns=arrival_ns, stamp_ns=stamp_ns, candidate=candidate, new_segment=is_new
             )
 
-    def _seen_anew(self, candidate: KeyframeCandidate, lap_ns: int, is_begun: bool) -> KeyframeCandidate:
+    def _seen_anew(self, candidate: OdometryKeyframe, lap_ns: int, is_begun: bool) -> OdometryKeyframe:
         """Return the candidate with a noisier image, `lap_ns` later; the start of a segment if none is
         begun."""
         image, pixels = candidate.image, decompress(candidate.image, self.hello.rig.cam0)

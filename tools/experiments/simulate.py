@@ -43,7 +43,7 @@ from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
 from share.metrics.frame_log import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
 from share.protocol.agent_events import LocalisedPose  # noqa: E402
-from share.types import F64, I64, KeyframeCandidate  # noqa: E402
+from share.types import F64, I64, OdometryKeyframe  # noqa: E402
 
 # others have agents that send raw frames
 SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]
@@ -177,7 +177,7 @@ def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[Tracke
 
 
 @lru_cache(64)
-def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float | None]]:
+def offered(agent: AgentKeyframes) -> list[tuple[int, OdometryKeyframe, float | None]]:
     """Return every keyframe as its tracker publishes it, its stamp, and odometry's error (cm) by then."""
     stamps = np.array([k.stamp_ns for k in agent.keyframes])
     error = LocalError((stamps, agent.T_world_body))
@@ -185,7 +185,7 @@ def offered(agent: AgentKeyframes) -> list[tuple[int, KeyframeCandidate, float |
     for keyframe, T in zip(agent.keyframes, agent.T_odom_body, strict=True):
         up, fresh = (keyframe.up, keyframe.up_sigma), keyframe.reference < 0
         seen = keyframe.view, fresh, keyframe.image
-        candidate = KeyframeCandidate(T, keyframe.T_ref_body, keyframe.cov, *up, *seen)
+        candidate = OdometryKeyframe(T, keyframe.T_ref_body, keyframe.cov, *up, *seen)
         out.append((keyframe.stamp_ns, candidate, error.update(keyframe.stamp_ns, T)))
     return out
 

@@ -56,7 +56,7 @@ from share.lab.evaluate.emulated_network import load_network  # noqa: E402
 from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
 from share.lab.evaluate.simulation import SimulatedRun, Simulation  # noqa: E402
 from share.protocol import agent_events as ev  # noqa: E402
-from share.protocol.agent import Agent  # noqa: E402
+from share.protocol.agent import AgentProtocol  # noqa: E402
 from share.scheduling.qoe import QoeParameters, qoe  # noqa: E402
 from share.types import AgentKind  # noqa: E402
 from share.wire.messages import Evaluation  # noqa: E402
@@ -125,7 +125,7 @@ class SampledSimulation(Simulation):
 World = TypeVar("World", bound=SampledSimulation)
 
 
-def _waiting_ms(agent: Agent, now_ns: int) -> float:
+def _waiting_ms(agent: AgentProtocol, now_ns: int) -> float:
     """Return how long the oldest keyframe that is not acknowledged has been waiting."""
     return agent._self_evaluation.delay.waiting_ms(now_ns)
 

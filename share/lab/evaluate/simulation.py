@@ -31,13 +31,13 @@ from share.mapping.steps import AlignStep, DescribeStep, IndexStep, QueryStep, V
 from share.metrics.frame_log import RunLog
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
-from share.protocol.agent import Agent
+from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, SendToEdge, Tick
-from share.protocol.edge import Edge
+from share.protocol.edge import EdgeProtocol
 from share.protocol.peer import restored_runs
 from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore
-from share.types import F64, KeyframeCandidate, TrackState
+from share.types import F64, OdometryKeyframe, TrackState
 from share.wire.codec import message_bytes
 from share.wire.layouts import Bytes
 from share.wire.messages import Hello, peer_id
@@ -59,7 +59,7 @@ class TrackedFrame:
     arrival_ns: int
     T_odom_body: F64 | None
     error_cm: float | None = None
-    candidate: KeyframeCandidate | None = None
+    candidate: OdometryKeyframe | None = None
     stamp_ns: int | None = None
     state: TrackState = TrackState.OK
     new_segment: bool = False
@@ -112,7 +112,7 @@ class Simulation:
         """Start edge and mapper with what the store keeps, or empty."""
         kept = StoredMap() if self._store is None else self._store.load()
         restored = restored_runs(kept, self._config.merge.enter_m)
-        self.edge = Edge(self._config, session, has_store=self._store is not None, restored=restored)
+        self.edge = EdgeProtocol(self._config, session, has_store=self._store is not None, restored=restored)
         archive = None if self._store is None else KeyframeArchive(self._store.path)
         self.mapper = Mapper(self._config, archive) if mapper is None else mapper
         if kept.runs:
@@ -153,7 +153,7 @@ class Simulation:
         network: NetworkModel,
         rngs: list[np.random.Generator],
     ) -> None:
-        member = SimulatedRun(hello, Agent(hello, self._config), frames, network, rngs)
+        member = SimulatedRun(hello, AgentProtocol(hello, self._config), frames, network, rngs)
         self._members[member.peer] = member
         self._schedule_next_frame(member)
 
@@ -281,14 +281,14 @@ class Simulation:
     def _run_mapper_round(self) -> None:
         """Run one round: apply all messages, start a solve, send the results, do one lookup step."""
         self._is_busy = True
-        findings, spent_ns = list[MapEvent](), 0
+        map_events, spent_ns = list[MapEvent](), 0
         while self._inbox:
             delay, action = self._inbox.popleft()
-            findings += action()
+            map_events += action()
             spent_ns += self._draw(delay)
         self.mapper_busy_ns += spent_ns
         self._start_solving(spent_ns)
-        self._schedule_mapper(spent_ns, lambda: self._send_findings(findings))
+        self._schedule_mapper(spent_ns, lambda: self._send_map_events(map_events))
         step = self.mapper.next_lookup()
         if step is None:
             self._schedule_mapper(spent_ns, self._mapper_idle)
@@ -299,7 +299,7 @@ class Simulation:
         self._schedule_mapper(spent_ns + step_ns, lambda: self._step_done(step, result))
 
     def _step_done(self, step: Any, result: object) -> None:
-        self._send_findings(self.mapper.finish_step(step, result, 0.0))
+        self._send_map_events(self.mapper.finish_step(step, result, 0.0))
         self._run_mapper_round()
 
     def _mapper_idle(self) -> None:
@@ -335,10 +335,10 @@ class Simulation:
         checked = delays.check_loop
         return Delay(verified.p50 + checked.p50, verified.p95 + checked.p95)
 
-    def _send_findings(self, findings: list[MapEvent]) -> None:
-        findings, changes = [*findings, *self.mapper.take_events()], self.mapper.take_changes()
-        if findings or changes:
-            self._to_edge(ed.MapperResult(tuple(findings), changes))
+    def _send_map_events(self, map_events: list[MapEvent]) -> None:
+        map_events, changes = [*map_events, *self.mapper.take_events()], self.mapper.take_changes()
+        if map_events or changes:
+            self._to_edge(ed.MapperResult(tuple(map_events), changes))
 
 
 def _random_normals(rng: np.random.Generator) -> Iterator[float]:
@@ -362,7 +362,7 @@ class SimulatedRun:
     def __init__(
         self,
         hello: Hello,
-        machine: Agent,
+        machine: AgentProtocol,
         incoming: Iterator[TrackedFrame],
         network: NetworkModel,
         rngs: list[np.random.Generator],

@@ -29,19 +29,19 @@ _APPLY_SIGMAS = 2.5  # significance at which a scale is corrected
 _KEEP_SIGMAS = 1.25  # significance down to which it stays corrected
 _MIN_SCALE_CHANGE = 0.001  # log scale
 _EVENTS: dict[str, EventKind] = {  # by state
-    "set apart": "agent quarantined",
+    "quarantined": "agent quarantined",
     "disputed": "agents disputed",
 }
 
 
 @dataclass(frozen=True)
-class AgentStanding:
+class AgentConsistency:
     """How an agent agrees with the others, as reported.
 
-    state: `agrees`, `set apart` (quarantined), `disputed` or `unknown`. log_scale, sigma: of its depths
-    relative to the others'; put_right: the part that is corrected. nis: of its loops, see
-    `share.mapping.agents.pairwise`; None where unknown. doubt: severity of its worst contradiction with
-    another agent; a disagreement begins at 1. widened: factor on the variances of its odometry, which it
+    state: `agrees`, `quarantined`, `disputed` or `unknown`. log_scale, sigma: of its depths relative to the
+    others'; corrected_log_scale: the part that is corrected. nis: of its loops, see
+    `share.mapping.agents.pairwise`; None where unknown. severity: of its worst contradiction with another
+    agent; a disagreement begins at 1. covariance_scale: factor on the variances of its odometry, which it
     understates.
     """
 
@@ -49,10 +49,10 @@ class AgentStanding:
     reason: str = ""
     log_scale: float | None = None
     sigma: float | None = None
-    put_right: float = 0.0
+    corrected_log_scale: float = 0.0
     nis: float | None = None
-    doubt: float = 0.0
-    widened: float = 1.0
+    severity: float = 0.0
+    covariance_scale: float = 1.0
 
     @property
     def event(self) -> tuple[EventKind, str]:
@@ -129,7 +129,7 @@ class AgentAgreement:
 
     def add_loop(
         self,
-        agents: AgentNames,
+        run_keys: tuple[str, str],
         segments: tuple[int, int],
         edge: PoseEdge,
         scale: DepthScale | None,
@@ -139,7 +139,7 @@ class AgentAgreement:
 
         scale, tilt: see `InterAgentLoop`. Returns whether the quarantined or disputed agents have changed.
         """
-        first, second = (self.identities.identity(run) for run in agents)
+        first, second = (self.identities.identity(run) for run in run_keys)
         if self.identities.name(first) == self.identities.name(second):
             return False
         if first > second:
@@ -178,7 +178,7 @@ class AgentAgreement:
             else ""
         )
 
-    def standing(self, run: str) -> AgentStanding:
+    def standing(self, run: str) -> AgentConsistency:
         """Return how the run's agent agrees with the others."""
         agent = self.identities.identity(run)
         pairs = {names: pair for names, pair in self.pairs.items() if agent in names}
@@ -188,7 +188,7 @@ class AgentAgreement:
         state = "agrees" if any(pair.agrees for pair in pairs.values()) else "unknown"
         reason = ""
         if agent in self.quarantined:
-            state, reason = "set apart", _contradiction_text(agent, disagreeing) + ": check its calibration"
+            state, reason = "quarantined", _contradiction_text(agent, disagreeing) + ": check its calibration"
         elif any(frozenset(names) in self.disputed for names, _ in disagreeing):
             state, reason = (
                 "disputed",
@@ -197,7 +197,7 @@ class AgentAgreement:
         elif agent in self.identities.unverified:
             state, reason = "unknown", f"not compared with the others yet: {self._unverified_cause(agent)}"
         worst = max((pair.severity for pair in pairs.values()), default=0.0)
-        return AgentStanding(
+        return AgentConsistency(
             state,
             reason,
             log,

@@ -13,7 +13,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.mapping.agents.agent_pair import tilt_between
-from share.mapping.agents.agreement import AgentAgreement, AgentStanding
+from share.mapping.agents.agreement import AgentAgreement, AgentConsistency
 from share.mapping.graph.edges import PoseEdge
 from share.mapping.keyframe_removal import RemovedKeyframe
 from share.mapping.loop_acceptance import LoopAcceptance, LoopDecision
@@ -32,7 +32,7 @@ _COMPARED_AT_ONCE = 8  # pairs of views, after which no further loop is decided
 class QuarantineChange:
     """Agents with a new standing, and the loops removed (dropped) or accepted again (added) because of it."""
 
-    standings: dict[str, AgentStanding] = field(default_factory=dict)
+    standings: dict[str, AgentConsistency] = field(default_factory=dict)
     dropped: tuple[Loop, ...] = ()
     added: tuple[Loop, ...] = ()
 

@@ -82,7 +82,7 @@ def keypoint_jacobian(T: F64, y: F64, moved: F64) -> F64:
     return np.asarray((top - moved[:, None] * projection[2]) / z)
 
 
-def refine_pose(
+def refine_relative_pose(
     T_c_q: F64,
     y_q: F64,
     y_c: F64,

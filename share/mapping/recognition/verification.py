@@ -17,7 +17,7 @@ from share.geometry import se3
 from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import rays
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
-from share.mapping.recognition.refinement import KeypointNoise, refine_pose, transfer_keypoints
+from share.mapping.recognition.refinement import KeypointNoise, refine_relative_pose, transfer_keypoints
 from share.types import F64, View
 from share.vision.matching import DescriptorPairs, close_pairs, hamming_matrix, mutual_best, pairs_within
 
@@ -163,7 +163,7 @@ def _verify_or_raise(query: CameraView, candidate: CameraView, seed: int) -> Ver
     has_gravity = bool(query.up.any() and candidate.up.any())
     if not has_gravity and len(initial_poses) > 1:
         raise _RefusedError("the two directions give different poses, and gravity is unknown")
-    fit = _best_fit(_refine_poses(initial_poses, candidate_pairs, y_q, y_c, noises))
+    fit = _best_fit(_refine_relative_poses(initial_poses, candidate_pairs, y_q, y_c, noises))
     _require_count(fit.inliers, MIN_INLIERS, "inliers")
     for y, side in ((fit.inliers_q, "query"), (fit.inliers_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
@@ -194,7 +194,7 @@ def _keypoint_noise(camera_view: CameraView) -> KeypointNoise:
     return KeypointNoise(SIGMA_PX / camera_view.focal, SIGMA_INVERSE_DEPTH)
 
 
-def _refine_poses(
+def _refine_relative_poses(
     initial_poses: list[F64],
     candidate_pairs: DescriptorPairs,
     y_q: F64,
@@ -220,7 +220,7 @@ def _refine_matches(
     initial_pose: F64, y_q: F64, y_c: F64, noises: tuple[KeypointNoise, KeypointNoise]
 ) -> _PoseFit:
     """Refine the pose by matched keypoints, and select the inliers."""
-    refined = refine_pose(initial_pose, y_q, y_c, *noises, INLIER_CHI2)
+    refined = refine_relative_pose(initial_pose, y_q, y_c, *noises, INLIER_CHI2)
     is_inlier = refined.d2 < INLIER_CHI2
     return _PoseFit(refined.T, refined.cov, (y_q, y_c), y_q[is_inlier], y_c[is_inlier])
 

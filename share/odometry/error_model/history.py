@@ -9,7 +9,7 @@ import numpy as np
 
 from share.geometry.se3 import compose_cov, position_sigma, rotation_angle
 from share.metrics.local_error import WINDOW_S
-from share.types import F64, KeyframeCandidate, TrackState
+from share.types import F64, OdometryKeyframe, TrackState
 
 
 class FrameOutcome(NamedTuple):
@@ -59,7 +59,7 @@ class MotionHistory:
         while self._frames[0].stamp_ns <= outcome.stamp_ns - 2 * self._window_ns:
             self._frames.popleft()
 
-    def add_keyframe(self, stamp_ns: int, candidate: KeyframeCandidate) -> RecentMotion:
+    def add_keyframe(self, stamp_ns: int, candidate: OdometryKeyframe) -> RecentMotion:
         """Add the keyframe with this stamp, that of the last frame or of one shortly before. Return the
         motion up to it."""
         start_ns = stamp_ns - self._window_ns + 1

@@ -49,5 +49,5 @@ def test_all_that_an_edge_shows_is_shown(plain_session: Path) -> None:
     assert len(seen.poses) == 40 and len(seen.reports) == 4
     assert {one.hello.name for one in seen.effects if isinstance(one, AddRun)} == set(session.agents)
     assert any(isinstance(one, AddKeyframe) for one in seen.effects)
-    assert any(one.findings for one in seen.results)
+    assert any(one.map_events for one in seen.results)
     assert len(seen.poses[-1]) == 3 and set(seen.reports[-1]["agents"]) == set(session.agents)

@@ -26,7 +26,7 @@ Downlink = Welcome | Refused | Pong | ClientDownlink | ClientUplink
 
 
 @dataclass(frozen=True)
-class KnownCommand:
+class ForwardedCommand:
     """A command of a client. robot: to which it was passed; None: to none yet. final: its last state, if
     nothing follows."""
 
@@ -47,7 +47,7 @@ class Client(Sender):
     last_received_ns: int
     requests: dict[int, tuple[int, str | None]] = field(default_factory=dict)
     forgotten_below: int = 0
-    commands: dict[int, KnownCommand] = field(default_factory=dict)
+    commands: dict[int, ForwardedCommand] = field(default_factory=dict)
     newest_command: int = -1
     seen_revision: int = -1
     list_due_ns: int = 0
@@ -67,9 +67,9 @@ class Client(Sender):
     def remember_command(
         self, command: int, robot: str | None = None, final: CommandState | None = None
     ) -> None:
-        """robot, final: as of `KnownCommand`; the first of each counts."""
-        known = self.commands.get(command, KnownCommand())
-        self.commands[command] = KnownCommand(known.robot or robot, known.final or final)
+        """robot, final: as of `ForwardedCommand`; the first of each counts."""
+        known = self.commands.get(command, ForwardedCommand())
+        self.commands[command] = ForwardedCommand(known.robot or robot, known.final or final)
         self.newest_command = max(self.newest_command, command)
         while len(self.commands) > _MAX_COMMANDS:
             del self.commands[min(self.commands)]

@@ -10,17 +10,17 @@ from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import SaveObject
 from share.protocol import edge_events as ed
 from share.protocol.admission import RunRegistry
-from share.protocol.command_desk import CommandDesk
+from share.protocol.client_registry import Client, ClientRegistry
+from share.protocol.command_service import CommandService
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.known_maps import KnownMaps
-from share.protocol.object_desk import ObjectDesk
+from share.protocol.object_service import ObjectService
 from share.protocol.peer import fault_lines
-from share.protocol.room_clients import Client, ClientRegistry
 from share.wire import messages as wire
 from share.wire import room_messages as room
 
 
-class RoomDesk:
+class ClientService:
     """Serves the clients of one room. session: of the edge. runs: its agents."""
 
     def __init__(
@@ -33,8 +33,8 @@ class RoomDesk:
     ) -> None:
         self._out, self._runs, self._session = out, runs, session
         self.clients, self.maps = ClientRegistry(out, silent_s), KnownMaps()
-        self._objects = ObjectDesk(out, self.clients, self.maps, session, stored)
-        self._commands = CommandDesk(out, self.clients, self.maps)
+        self._objects = ObjectService(out, self.clients, self.maps, session, stored)
+        self._commands = CommandService(out, self.clients, self.maps)
 
     # ------------------------------------------------------------ clients
 
@@ -92,20 +92,20 @@ class RoomDesk:
 
     # ------------------------------------------------------------ maps
 
-    def restore(self, findings: Iterable[MapEvent]) -> None:
+    def restore(self, map_events: Iterable[MapEvent]) -> None:
         """Take in the maps of runs of an earlier session."""
-        for finding in findings:
-            self.on_finding(finding)
+        for map_event in map_events:
+            self.on_map_event(map_event)
 
     def begin_segment(self, run: str, keyframe: int) -> None:
         self.maps.begin_segment(run, keyframe)
 
-    def on_finding(self, finding: MapEvent) -> None:
+    def on_map_event(self, map_event: MapEvent) -> None:
         """Follow a decision of the mapper."""
-        if finding.joined is not None:
-            self.maps.record_join(finding.joined)
-        if finding.correction is not None and finding.agent is not None:
-            move = self.maps.add_correction(finding.agent, finding.correction)
+        if map_event.joined is not None:
+            self.maps.record_join(map_event.joined)
+        if map_event.correction is not None and map_event.agent is not None:
+            move = self.maps.add_correction(map_event.agent, map_event.correction)
             if move is not None:
                 self._objects.follow(move)
 

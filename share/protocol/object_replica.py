@@ -7,7 +7,7 @@ from dataclasses import replace
 from share.wire.room_messages import MAX_LISTED, ObjectList, ObjectsSeen, RoomObject
 
 
-class ObjectMirror:
+class ObjectReplica:
     """The objects of one session of the edge; those of the session before stay until the first list that is
     complete."""
 

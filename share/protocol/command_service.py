@@ -10,10 +10,10 @@ import numpy as np
 
 from share.errors import printable
 from share.geometry import se3
+from share.protocol.client_registry import Client, ClientRegistry, permission_objection
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.known_maps import KnownMaps
-from share.protocol.room_clients import Client, ClientRegistry, permission_objection
 from share.wire.room_messages import (
     MAX_ANSWER_LENGTH,
     Cancel,
@@ -24,7 +24,7 @@ from share.wire.room_messages import (
 )
 
 
-class CommandDesk:
+class CommandService:
     """Passes commands to the bridges of robots, and what they say to commanders and all that want robots.
 
     places: where each robot was last."""

@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Collection, Sequence
 
 from share.mapping.map_changes import RemoveStoredObject, SaveObject
+from share.protocol.client_registry import Client, ClientRegistry, permission_objection
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.known_maps import KnownMaps, MapMoved
-from share.protocol.room_clients import Client, ClientRegistry, permission_objection
 from share.protocol.room_objects import RoomObjects
 from share.timing import seconds_to_ns
 from share.wire.room_messages import (
@@ -26,7 +26,7 @@ _LIST_S, _MAX_LIST_S = 0.25, 2.0  # pause between lists to a client that has not
 _MAX_UNSAVED = 64  # requests that wait for the disk
 
 
-class ObjectDesk:
+class ObjectService:
     """Serves the objects of one room to its clients."""
 
     def __init__(
