@@ -20,6 +20,8 @@ def samples() -> Iterator[tuple]:
 
 
 def main() -> None:
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
     rig = load_calibration(sys.argv[2]) if len(sys.argv) > 2 else open_recording(sys.argv[1]).rig
     tracker = Tracker(rig)
     for kind, *sample in samples():

@@ -11,6 +11,8 @@ from share import Room, ShareError
 
 
 def main() -> None:
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     edge, name, *robot = sys.argv[1:]
     with Room(edge, name) as room:
         cube = room.put("cube", (1.0, 2.0, 0.5))  # m, in the map of the agent of this name, or the only one

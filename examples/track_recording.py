@@ -9,6 +9,8 @@ import numpy as np
 
 from share import Tracker, open_recording
 
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
 recording = open_recording(sys.argv[1])
 tracker = Tracker(recording.rig, rate_hz=recording.rate_hz)
 for frame in recording:

@@ -51,6 +51,14 @@ def test_own_camera(plain_session):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("name", ["track_recording", "own_camera", "run_edge", "shared_objects"])
+def test_without_arguments_an_example_says_how_it_is_called(name: str) -> None:
+    done = started(f"{name}.py")
+    _, err = done.communicate(timeout=60)
+    assert done.returncode == 1 and f"python examples/{name}.py " in err and "Traceback" not in err
+
+
+@pytest.mark.long
 def test_run_edge(plain_session):
     *agents, maps = lines_of("run_edge.py", plain_session / "ar1", plain_session / "ar2")
     assert len(agents) == 2 and all("m in odom, map ar" in line for line in agents)

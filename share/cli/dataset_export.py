@@ -23,11 +23,14 @@ def export_map_tables(source: str, out: Path, as_json: bool) -> None:
     from share.store.export import export_map
     from share.store.map_store import is_map
 
-    if not Path(source).is_file():
-        raise UsageError(f"{source}: no such file")
-    if not is_map(Path(source)) and Path(source).suffix in (".mcap", ".bag", ".db3"):
-        raise UsageError(f"{source}: is not a map; for a recording give --format")
-    map_state = _read_map(Path(source))
+    path = Path(source)
+    if not is_map(path):
+        if not (path.exists() or path.parent.is_dir()):
+            raise UsageError(f"{source}: no such file")
+        raise UsageError(
+            f"{source}: is not a map, and --format tum is for maps; give mcap, rrd, colmap or kitti"
+        )
+    map_state = _read_map(path)
     with progress(len(map_state.keyframes), "exporting") as bar:
         exported = export_map(map_state, out, bar)
     if as_json:

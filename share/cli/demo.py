@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
+from share.cli.completion import complete_scene
 from share.cli.live_pages import RunScreen
 from share.cli.terminal import Column, LiveLine, Stages, column_table
 from share.config import BASE_POLICY, STREAMED
@@ -42,7 +43,11 @@ class _Seconds(click.FloatRange):
 @options.true_error
 @options.config
 @click.option("--out", metavar="DIR", type=options.PATH, default="share-demo", help="Output folder.")
-@click.option("--scene", help="Kind of room (see share emulate --help).  [default: warehouse]")
+@click.option(
+    "--scene",
+    shell_complete=complete_scene,
+    help="Kind of room (see share emulate --help).  [default: warehouse]",
+)
 @click.option(
     "--seed", type=click.IntRange(0), help="Seed of the room.  [default: one where agents meet soon]"
 )

@@ -43,8 +43,9 @@ class HttpGuard:
 
     def __init__(self, address: Address, token: str | None = None) -> None:
         self.is_local, self._token = address.local, token
-        self._cookie_name = f"share_{address.port}"
-        self._cookie = "" if token is None else hashlib.sha256(f"cookie {token}".encode()).hexdigest()
+        # Named by the token, not the port: browsers send it to all ports, so one opens all pages of an edge.
+        self._cookie_name = f"share_{_digest(f'name {token}')[:8]}"
+        self._cookie = "" if token is None else _digest(f"cookie {token}")
 
     def check(self, target: str, headers: Mapping[str, str]) -> HttpRefusal | None:
         """Return what to answer instead; None if the request is served.
@@ -70,7 +71,9 @@ class HttpGuard:
             headers.get("authorization", "")
         ):
             return None
-        text = "a token is needed: open the address that the edge printed, or give the token as password"
+        text = (
+            "a token is needed, that in the file of --http-token: open /?token=TOKEN, or give it as password"
+        )
         ask = 'WWW-Authenticate: Basic realm="SHARE: any name, the token as password", charset="UTF-8"'
         return HttpRefusal(HTTPStatus.UNAUTHORIZED, text, (ask,))
 
@@ -124,6 +127,10 @@ def _is_local_name(host: str) -> bool:
     host_part, colon, port = host.rpartition(":")
     name = (host_part if colon and port.isdecimal() else host).strip("[]").lower()
     return name == "localhost" or Address(name, 0).local
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def http_address(option: str, text: str, token: str | None) -> Address:

@@ -86,9 +86,10 @@ class ClientService:
 
     def _default_map(self, client: Client) -> str | None:
         """Return the map in which a client means a place: that of its agent, or the only one of the room."""
-        own = {run.map_id for run in self._runs.present() if run.name == client.name}
-        maps = (own or {run.map_id for run in self._runs.present()}) - {None}
-        return maps.pop() if len(maps) == 1 else None
+        shown = [(run.name, run.map_id) for run in self._runs.present() if run.map_id is not None]
+        own = {map_id for name, map_id in shown if name == client.name}
+        maps = own or {map_id for _, map_id in shown} or self.maps.ids()
+        return next(iter(maps)) if len(maps) == 1 else None
 
     # ------------------------------------------------------------ maps
 

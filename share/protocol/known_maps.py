@@ -39,8 +39,11 @@ class KnownMaps:
         self._solved: frozenset[str] = frozenset()
 
     def __contains__(self, map_id: str) -> bool:
-        shown = any(correction.map_id == map_id for correction in self._corrections.values())
-        return shown or map_id in self._solved
+        return map_id in self.ids()
+
+    def ids(self) -> frozenset[str]:
+        """Return the maps that a run was last shown, and those of the newest solution."""
+        return self._solved | {correction.map_id for correction in self._corrections.values()}
 
     def add_solved(self, map_ids: Collection[str]) -> None:
         """Set the maps of the newest solution."""

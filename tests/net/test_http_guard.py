@@ -92,6 +92,15 @@ def test_a_token_in_the_address_becomes_a_cookie(target: str, where: str) -> Non
     assert guard.cookie_headers() == refusal.headers[1:]
 
 
+def test_status_page_and_live_room_share_a_cookie_and_two_edges_do_not() -> None:
+    (given,) = HttpGuard(REMOTE, TOKEN).cookie_headers()
+    cookie = given.partition(": ")[2].partition(";")[0]
+    other_port = HttpGuard(Address("192.0.2.7", 8081), TOKEN)
+    assert status(other_port, cookie=cookie) is None
+    (others,) = HttpGuard(REMOTE, "another" + TOKEN).cookie_headers()
+    assert others.partition("=")[0] != given.partition("=")[0]
+
+
 @pytest.mark.parametrize(
     "target", ["//[x", "/?token=\udcc3\udca9", "/?token=%ed%a0%80", "/?token=\xe9", "http://[/"]
 )

@@ -71,6 +71,16 @@ def test_without_a_map_id_it_is_that_of_the_senders_agent(bench) -> None:
     assert answers(bench, bench.bob) == {1: "the room has no map yet, or several; name one (map_id)"}
 
 
+def test_without_an_agent_it_is_the_only_map_of_the_room() -> None:
+    bench = RoomBench()
+    bench.solved(MAP)
+    bob = bench.client("bob", 12, wants_objects=True)
+    bench.run(0.1)
+    bench.put(bob, 1, 8, at(1, 2))
+    bench.run(0.1)
+    assert answers(bench, bob) == {1: ""} and bench.clients[bob].objects[8].map_id == MAP
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_loss_doubles_and_disorder_heal(seed: int) -> None:
     bench = prepared(RoomBench(seed=seed))
