@@ -71,7 +71,7 @@ ALLOWED = {
     ("net/keys.py", "fdopen"): "likewise",
     ("net/http_guard.py", "open"): "a new file that nobody else can read",
     ("net/http_guard.py", "fdopen"): "likewise",
-    ("view/viewer.py", "open"): "/dev/null",
+    ("view/page_process.py", "open"): "/dev/null",
     ("cli/evaluate_paper.py", "read_text"): "the report that it has just written",
     ("lab/evaluate/side_by_side.py", "open"): "a table of a run that it has just made",
     ("view/viewer.py", "loads"): "the other end of a pipe between our own processes",
