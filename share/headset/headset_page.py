@@ -1,0 +1,167 @@
+"""The headset page of an edge: its address, its process, and what that tells (docs/do/headset.md)."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from share.errors import UsageError, install_hint
+from share.files.writing import writable_dir
+from share.headset.certificate import (
+    PageCertificate,
+    default_folder,
+    given_certificate,
+    own_certificate,
+    session_key,
+)
+from share.headset.measures import HEADSET_TABLE
+from share.headset.mounts import read_mounts
+from share.headset.wearers import EdgeAccess
+from share.net.http_guard import http_address, listen
+from share.net.transport import Address, parse_address
+from share.view.feed import ViewFeed
+from share.view.page_process import PageProcess, last_words, silence_output
+
+COLLECT_S = 1 / 60  # between messages to the process: poses are relayed at 30 Hz
+_NICENESS = 5  # below the edge, above the live room
+_TITLE = "headset page"
+_ANY = "a token that is not used"
+
+
+def page_address(text: str) -> tuple[Address, bool]:
+    """Return the address of --headset and whether it is to be encrypted. Raises UsageError."""
+    scheme, marker, rest = text.partition("://")
+    where = rest if marker else text
+    if marker and scheme not in ("http", "https"):
+        raise UsageError(f"--headset {text}: expected HOST:PORT, or http://127.0.0.1:PORT for `adb reverse`")
+    address = http_address("--headset", where.rstrip("/"), _ANY)  # a code is asked for, not a token
+    if scheme == "http" and marker and not address.local:
+        raise UsageError(
+            f"--headset {text}: a browser gives WebXR to an encrypted page only; without http:// it is one"
+        )
+    return address, not (marker and scheme == "http")
+
+
+def page_certificate(
+    certificate: Path | None, key: Path | None, is_encrypted: bool, host: str
+) -> PageCertificate | None:
+    """Return the certificate that is given, else our own; None without encryption. Raises UsageError."""
+    if (certificate is None) != (key is None):
+        raise UsageError("--headset-cert, --headset-key: give both, or leave both out")
+    if not is_encrypted:
+        if certificate is not None:
+            raise UsageError("--headset-cert: http:// is not encrypted; leave it out, or leave out http://")
+        return None
+    if certificate is not None and key is not None:
+        return given_certificate(certificate, key)
+    return own_certificate(default_folder(), host)
+
+
+class HeadsetPage:
+    """A process that serves the page, and the feed to it. One that ends by itself is started again. `close`
+    may be repeated.
+
+    address: as of `page_address`. edge_access: asked for once, after the address is bound. mounts: as of
+    `read_mounts`. out: folder for what pages measure. notify: is called with lines, from another thread.
+    Raises UsageError for what is malformed or missing, TransportError if the address cannot be bound.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        access: EdgeAccess,
+        *,
+        certificate: Path | None = None,
+        key: Path | None = None,
+        mounts: Sequence[str] = (),
+        out: Path | None = None,
+        notify: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        if find_spec("websockets") is None:
+            raise UsageError(f"--headset: {install_hint('websockets', 'headset')}")
+        from share.headset.server import HeadsetSettings, ServerReport
+
+        where, is_encrypted = page_address(address)
+        self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
+        table = None if out is None else writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE
+        known_mounts = read_mounts(mounts)
+        self._listener, bound = listen(where)
+        self.endpoint = str(bound).removeprefix("tcp://")
+        self.scheme = "https" if is_encrypted else "http"
+        self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
+        self._report: dict[str, Any] = {}
+        self.feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
+        settings = HeadsetSettings(
+            access, where.host, self.certificate, session_key(default_folder()), known_mounts, table
+        )
+        arguments = (self._listener, settings)
+        self._process = PageProcess(_TITLE, _run, arguments, notify, self.feed.reconnect, self._hear)
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether there is a process that serves the page, or will in a moment."""
+        return self._process.is_alive
+
+    def report(self) -> dict[str, Any]:
+        """Return the field `headset` of the edge's report: its address, the code, and its wearers. Safe from
+        any thread."""
+        address = f"{self.scheme}://{self.endpoint}/"
+        fingerprint = None if self.certificate is None else self.certificate.fingerprint
+        return {"address": address, "fingerprint": fingerprint, **self._report}
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.announce_end()
+        self.feed.close()
+        self._process.close()
+        self._listener.close()
+
+    def _hear(self, data: bytes) -> None:
+        """Take what the process says."""
+        with contextlib.suppress(msgspec.DecodeError):
+            said = self._decoder.decode(data)
+            if said.line:
+                self._notify(said.line)
+            else:
+                self._report = {key: value for key, value in msgspec.structs.asdict(said).items() if key != "line"}
+
+
+def local_address(endpoint: str) -> str:
+    """Return the address at which this machine reaches what is bound at `endpoint`."""
+    address = parse_address(endpoint)
+    everywhere = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+    return str(Address(everywhere.get(address.host, address.host), address.port))
+
+
+def _run(pipe: Connection, listener: socket.socket, settings: Any) -> None:
+    """Entry point of the process."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
+    os.nice(_NICENESS)
+    silence_output()
+    from share.headset.server import HeadsetServer
+
+    listener.setblocking(False)
+    code = 1
+    try:
+        HeadsetServer(pipe, listener, settings).run()
+        code = 0
+    except (EOFError, BrokenPipeError):  # the parent has ended
+        code = 0
+    except Exception as error:
+        with contextlib.suppress(OSError):
+            pipe.send_bytes(last_words(error))
+    finally:
+        os._exit(code)  # threads of wearers would keep the process
