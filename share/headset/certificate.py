@@ -39,6 +39,7 @@ class PageCertificate:
 
     def context(self) -> ssl.SSLContext:
         """Return the settings of a TLS server with it. Raises UsageError."""
+        _read(self.key, f"--headset-key {self.key}")
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         try:
@@ -60,7 +61,9 @@ def given_certificate(certificate: Path, key: Path, now: datetime | None = None)
     """Return the certificate in two files. Raises UsageError."""
     found = _described(certificate, key, f"--headset-cert {certificate}")
     if found.end <= (now or datetime.now(UTC)):
-        raise UsageError(f"--headset-cert {certificate}: it was valid until {found.end:%Y-%m-%d}; give a newer one")
+        raise UsageError(
+            f"--headset-cert {certificate}: it was valid until {found.end:%Y-%m-%d}; give a newer one"
+        )
     found.context()
     return found
 

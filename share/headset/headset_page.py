@@ -23,7 +23,7 @@ from share.headset.certificate import (
     own_certificate,
     session_key,
 )
-from share.headset.measures import HEADSET_TABLE
+from share.headset.measures import HEADSET_TABLE, begin_table
 from share.headset.mounts import read_mounts
 from share.headset.wearers import EdgeAccess
 from share.net.http_guard import http_address, listen
@@ -92,7 +92,7 @@ class HeadsetPage:
 
         where, is_encrypted = page_address(address)
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
-        table = None if out is None else writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE
+        table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
         self._listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
@@ -136,7 +136,8 @@ class HeadsetPage:
             if said.line:
                 self._notify(said.line)
             else:
-                self._report = {key: value for key, value in msgspec.structs.asdict(said).items() if key != "line"}
+                fields = msgspec.structs.asdict(said)
+                self._report = {key: value for key, value in fields.items() if key != "line"}
 
 
 def local_address(endpoint: str) -> str:

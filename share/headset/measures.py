@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from pathlib import Path
 from typing import Any
 
+from share.errors import UsageError
 from share.files.writing import open_new
 from share.headset.page_messages import PageMeasured
 from share.timing import TokenBuckets
@@ -18,17 +20,26 @@ _LIMIT = (4.0, 1.0)  # rows at once, and a second, of a wearer: pages send one e
 _MAX_ROWS = 10**6  # 100 MB: days of two wearers
 
 
-class MeasureTable:
-    """Writes rows as they come. path: None: nowhere. After the first failure of the disk it writes no more.
+def begin_table(path: Path) -> Path:
+    """Make a table without rows, in the place of an old one. Raises UsageError."""
+    try:
+        with open_new(path) as file:
+            file.write((",".join(COLUMNS) + "\r\n").encode())
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
 
-    Raises OSError if it cannot be made."""
+
+class MeasureTable:
+    """Adds rows as they come to a table that has been begun. path: None: there is none. After the first
+    failure of the disk it writes no more. Raises OSError."""
 
     def __init__(self, path: Path | None) -> None:
-        self._file = None if path is None else io.TextIOWrapper(open_new(path), "utf-8", newline="")
+        self._file: io.TextIOWrapper | None = None
+        if path is not None:
+            handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC)
+            self._file = io.TextIOWrapper(os.fdopen(handle, "wb"), "utf-8", newline="")
         self._rows, self._limits = 0, TokenBuckets(*_LIMIT)
-        if self._file is not None:
-            csv.writer(self._file).writerow(COLUMNS)
-            self._file.flush()
 
     def add(self, t_s: float, wearer: str, agent: str | None, measured: PageMeasured, now_ns: int) -> str:
         """Write a row. t_s: since the start. Return why no more can be written, else ""."""

@@ -1,4 +1,4 @@
-"""What one page is still to be sent: the newest of each thing, so a slow page skips and never has a backlog."""
+"""What one page is still to be sent: the newest of each thing. A slow page skips and never has a backlog."""
 
 from __future__ import annotations
 

@@ -47,9 +47,7 @@ def _line(status: HTTPStatus, text: str) -> PageAnswer:
 def read_page(folder: Path = FOLDER) -> dict[str, PageAnswer]:
     """Return the files of the page, by path. Raises OSError."""
     files = {
-        f"/{one.name}": PageAnswer(
-            HTTPStatus.OK, _TYPES[one.suffix[1:]], read_bytes(one, _MAX_FILE_BYTES)
-        )
+        f"/{one.name}": PageAnswer(HTTPStatus.OK, _TYPES[one.suffix[1:]], read_bytes(one, _MAX_FILE_BYTES))
         for one in sorted(folder.iterdir() if folder.is_dir() else ())
         if _NAME.fullmatch(one.name) and one.suffix[1:] in _TYPES and one.is_file() and not one.is_symlink()
     }
@@ -73,7 +71,8 @@ class PageGuard:
         """Return the answer to a request; None: it may become a WebSocket. headers: by name in lower case."""
         host, origin = headers.get("host"), headers.get("origin")
         if host is None or not self._is_own(host):
-            return _line(HTTPStatus.FORBIDDEN, "only requests for a name or address of this machine are served")
+            text = "only requests for a name or address of this machine are served"
+            return _line(HTTPStatus.FORBIDDEN, text)
         is_same = origin is not None and origin.lower() == f"{self._scheme}://{host.lower()}"
         if (origin is not None or is_upgrade) and not is_same:
             return _line(HTTPStatus.FORBIDDEN, "only the page of this server may connect")

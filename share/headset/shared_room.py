@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from share.geometry import se3
 from share.headset.frame_times import BodyMotion, LeastDelay, MotionEstimate
 from share.headset.page_messages import MAX_POINTS, numbers, pose_fields
 from share.protocol.known_maps import KnownMaps
@@ -211,4 +210,3 @@ class SharedRoom:
         ]
         points: F32 = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
         return points[:: 1 + max(0, len(points) - 1) // MAX_POINTS]
-

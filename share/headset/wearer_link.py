@@ -131,6 +131,14 @@ class WearerLink:
             case ev.CommandChanged(state):
                 self._tell(page.command_fields(state, self._page_number(state)))
 
+    def _page_number(self, state: CommandState) -> int | None:
+        """Return the page's number of a command; None of another's."""
+        if state.commander not in ("", self._name):
+            return None
+        if state.is_final:
+            return self._commands.pop(state.command, None)
+        return self._commands.get(state.command)
+
     # ------------------------------------------------------------------ how it stands with the edge
 
     def _note(self, text: str) -> None:

@@ -238,9 +238,7 @@ class WearerRegistry:
         while len(self._nonces) > _MAX_KNOWN:
             del self._nonces[next(iter(self._nonces))]
         name, access = session.name, self._access
-        wearer = Wearer(
-            session, lambda tell: WearerLink(access.address, name, access.keys_of(name), tell)
-        )
+        wearer = Wearer(session, lambda tell: WearerLink(access.address, name, access.keys_of(name), tell))
         self._wearers[name] = wearer
         return wearer
 

@@ -97,6 +97,47 @@ METRICS = (
         "unjoined.bad_messages",
     ),
 )
+_PER_WEARER = ("headset.wearers", ("wearer", "agent", "mode"))
+METRICS += (
+    MetricSpec("share_edge_headset_pages", "Headset pages that are connected.", "headset.pages"),
+    MetricSpec("share_edge_headset_wrong_codes_total", "Wrong codes that were given.", "headset.wrong_codes"),
+    MetricSpec(
+        "share_edge_headset_connected", "1 if the wearer's page is connected.", "is_connected", *_PER_WEARER
+    ),
+    MetricSpec(
+        "share_edge_headset_frames", "Frames that its page drew in its newest 2 s.", "frames", *_PER_WEARER
+    ),
+    MetricSpec(
+        "share_edge_headset_late_frames",
+        "Frames of these that were drawn over 20 ms after their pose's stamp.",
+        "over_20ms",
+        *_PER_WEARER,
+    ),
+    *(
+        MetricSpec(
+            f"share_edge_headset_lag_{name}_seconds",
+            f"From a pose's stamp until its frame was drawn, {name} of these.",
+            f"{name}_ms",
+            *_PER_WEARER,
+            scale=1e-3,
+        )
+        for name in ("p50", "p95", "p99")
+    ),
+    MetricSpec(
+        "share_edge_headset_alignment_metres",
+        "Standard deviation of where its own space is in the map.",
+        "alignment_mm",
+        *_PER_WEARER,
+        scale=1e-3,
+    ),
+    MetricSpec(
+        "share_edge_headset_drift_metres_per_second",
+        "How fast that moves.",
+        "drift_mm_s",
+        *_PER_WEARER,
+        scale=1e-3,
+    ),
+)
 _INFO = ("share_edge_agent_info", "State of an agent as labels; always 1.", ("agent", "kind", "state", "map"))
 _STEPS = ("share_edge_step_seconds", "Duration of a step of the mapper.")
 _POSES = (

@@ -48,8 +48,8 @@ class KeyframeArrived:
 @dataclass(frozen=True, eq=False)
 class PoseArrived:
     """A run's newest pose (4, 4), relative to its keyframe `keyframe`; -1: in odom. age_ms: as in
-    `PoseUpdate`; None: unknown. stamp_ns: by the agent's clock. received_ns: when it came to the edge, by this
-    machine's monotonic clock."""
+    `PoseUpdate`; None: unknown. stamp_ns: by the agent's clock. received_ns: when it came to the
+    edge, by this machine's monotonic clock."""
 
     run: str
     state: TrackState
