@@ -94,7 +94,7 @@ class PairingDesk:
 
     def check(self, given: str, address: str, now_ns: int) -> None:
         """Check a code from an address. Raises PairingError. Whoever is let in by it renews it."""
-        is_crowded = len(self._of_address) >= _MAX_ADDRESSES
+        is_crowded = self._of_address.count_used(now_ns) >= _MAX_ADDRESSES
         if is_crowded or not self._of_address.bucket(address, now_ns).take(now_ns):
             raise PairingError("too many codes from this address; wait ten seconds")
         if not self._of_all.take(now_ns):

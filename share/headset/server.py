@@ -230,10 +230,10 @@ class HeadsetServer:
         seat.reply(self._welcome(wearer, secret, rights))
         wearer.sit(seat)
         seat.outbox.put_poses(self._room.poses())
-        if taken_over is not None:
-            taken_over.connection.transport.abort()
         sender = asyncio.create_task(_send(seat))
         try:
+            if taken_over is not None:
+                await _refuse(taken_over.connection, f"another page goes on as '{wearer.name}'")
             await self._read(wearer, seat)
         except page.MessageError as error:
             sender.cancel()
