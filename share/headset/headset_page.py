@@ -25,6 +25,7 @@ from share.headset.certificate import (
 )
 from share.headset.measures import HEADSET_TABLE, begin_table
 from share.headset.mounts import read_mounts
+from share.headset.page_requests import FOLDER
 from share.headset.wearers import EdgeAccess
 from share.net.http_guard import http_address, listen
 from share.net.transport import Address, parse_address
@@ -70,8 +71,8 @@ class HeadsetPage:
     """A process that serves the page, and the feed to it. One that ends by itself is started again. `close`
     may be repeated.
 
-    address: as of `page_address`. edge_access: asked for once, after the address is bound. mounts: as of
-    `read_mounts`. out: folder for what pages measure. notify: is called with lines, from another thread.
+    address: as of `page_address`. access: of the clients of wearers. mounts: as of `read_mounts`. out: folder
+    for what pages measure. folder: with the page's files. notify: is called with lines, from another thread.
     Raises UsageError for what is malformed or missing, TransportError if the address cannot be bound.
     """
 
@@ -84,6 +85,7 @@ class HeadsetPage:
         key: Path | None = None,
         mounts: Sequence[str] = (),
         out: Path | None = None,
+        folder: Path = FOLDER,
         notify: Callable[[str], None] = lambda text: None,
     ) -> None:
         if find_spec("websockets") is None:
@@ -101,7 +103,7 @@ class HeadsetPage:
         self._report: dict[str, Any] = {}
         self.feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
         settings = HeadsetSettings(
-            access, where.host, self.certificate, session_key(default_folder()), known_mounts, table
+            access, where.host, self.certificate, session_key(default_folder()), known_mounts, table, folder
         )
         arguments = (self._listener, settings)
         self._process = PageProcess(_TITLE, _run, arguments, notify, self.feed.reconnect, self._hear)

@@ -30,7 +30,7 @@ from share.headset import page_messages as page
 from share.headset.certificate import PageCertificate
 from share.headset.measures import MeasureTable, measured_fields
 from share.headset.mounts import ViewerMount
-from share.headset.page_requests import PageAnswer, PageGuard, own_names, read_page
+from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
 from share.headset.pairing import PairingError
 from share.headset.shared_room import SharedRoom
 from share.headset.wearers import EdgeAccess, PageSeat, Wearer, WearerRegistry
@@ -63,7 +63,8 @@ _MAX_MOVES = 32  # of maps, that a page was told
 @dataclass(frozen=True)
 class HeadsetSettings:
     """What the server is started with. certificate: None: plain HTTP, of this machine alone. host: that it
-    listens on. session_key: that signs sessions. table: where what pages measure is written."""
+    listens on. session_key: that signs sessions. table: where what pages measure is written. folder: with the
+    page's files."""
 
     access: EdgeAccess
     host: str
@@ -71,6 +72,7 @@ class HeadsetSettings:
     session_key: bytes = field(repr=False)
     mounts: dict[str, ViewerMount] = field(default_factory=dict)
     table: Path | None = None
+    folder: Path = FOLDER
 
 
 class ServerReport(msgspec.Struct, omit_defaults=True):
@@ -91,7 +93,7 @@ class HeadsetServer:
         certificate = settings.certificate
         self._tls = None if certificate is None else certificate.context()
         names = own_names(settings.host, () if certificate is None else certificate.names)
-        self._guard = PageGuard("http" if certificate is None else "https", names, read_page())
+        self._guard = PageGuard("http" if certificate is None else "https", names, read_page(settings.folder))
         self._connections = PeerConnections(_LIMITS)
         self._room, self._wearers = SharedRoom(), WearerRegistry(settings.access, settings.session_key)
         self._table = MeasureTable(settings.table)
