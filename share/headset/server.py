@@ -43,7 +43,6 @@ from share.net.bounded_websocket import (
     PeerConnections,
     PeerLimits,
 )
-from share.timing import TokenBucket
 from share.view.events import SessionBegun
 from share.view.feed import END, batched
 from share.view.page_process import HEARTBEAT
@@ -51,7 +50,6 @@ from share.view.page_process import HEARTBEAT
 MAX_PAIRING, MAX_CONNECTIONS = 16, 100  # WebSockets that have not paired; connections before
 # Of a page: files are asked for one by one; then it drags at 30 Hz, pings and measures.
 _LIMITS = PeerLimits(MAX_PAIRING, MAX_CONNECTIONS, 200, 100.0, 2**18, 2**17)
-_POINTS_LIMIT = (2.0, 0.5)  # times that a page is sent the points of a map, at once and a second
 SILENT_S = 6.0  # a page pings more often; one that does not has gone
 _HELLO_S, _SEND_S, _CLOSE_S = 10.0, 5.0, 1.0
 _REPORT_S, _PATH_S = 0.5, 1.0
@@ -277,7 +275,6 @@ class HeadsetServer:
 
     async def _read(self, wearer: Wearer, seat: PageSeat) -> None:
         """Handle a page's messages. Raises MessageError, ConnectionClosed, TimeoutError."""
-        points_limit = TokenBucket(*_POINTS_LIMIT)
         while True:
             async with asyncio.timeout(SILENT_S):
                 data = await seat.connection.recv()
@@ -286,7 +283,7 @@ class HeadsetServer:
                     t_ms = time.monotonic_ns() / 1e6
                     seat.reply({"type": "pong", "n": n, "sent_ms": sent_ms, "t_ms": t_ms})
                 case page.PagePoints(map_id):
-                    if points_limit.take(time.monotonic_ns()):
+                    if seat.points_limit.take(time.monotonic_ns()):
                         self._send_points(seat, map_id)
                 case page.PageMeasured() as measured:
                     self._take_measured(wearer, measured)

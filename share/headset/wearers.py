@@ -25,11 +25,14 @@ from share.headset.pairing import SESSION_S, PairingDesk, PairingError, WearerSe
 from share.headset.wearer_link import Tell, WearerLink, refusal_of
 from share.net.keys import AgentKeys, allow_list
 from share.net.lent_keys import LentKeys
+from share.timing import TokenBucket, TokenBuckets
 from share.wire.room_messages import Permission
 
 MAX_WEARERS = 8
 ABSENT_S = 6.0  # a page that is away for longer commands no robot: what it sent stops
 _MAX_KNOWN = 256  # names whose newest session is remembered
+_POINTS_LIMIT = (2.0, 0.5)  # times that a page is sent the points of a map, at once and a second
+_COMMAND_LIMIT = (10.0, 5.0)  # goals of a page, and as many stops, at once and a second
 _MAX_COMMANDS = 16  # of a wearer, whose state is told again to a page that comes back
 
 
@@ -70,6 +73,12 @@ class PageSeat:
 
     def __init__(self, connection: Any) -> None:
         self.connection, self.outbox, self.wake = connection, Outbox(), asyncio.Event()
+        self.points_limit, self._command_limits = TokenBucket(*_POINTS_LIMIT), TokenBuckets(*_COMMAND_LIMIT)
+
+    def takes(self, command: PageCommand) -> bool:
+        """Return whether the page may give a command now: goals never keep it from stopping a robot."""
+        now_ns = time.monotonic_ns()
+        return self._command_limits.bucket(type(command).__name__, now_ns).take(now_ns)
 
     def reply(self, message: dict[str, Any]) -> None:
         self.outbox.reply(message)
@@ -123,6 +132,9 @@ class Wearer:
     def ask(self, wish: PageRequest | PageCommand) -> None:
         """Do what the page wants, or answer why not. A command that it repeats is the same one."""
         if isinstance(wish, PageGoto | PageCancel):
+            if self.seat is not None and not self.seat.takes(wish):
+                self._reply(refusal_of(wish, "too many commands at once", self.name))
+                return
             known, state = self._commands.get(wish.command, (None, None))
             if known == wish:
                 if state is not None:
