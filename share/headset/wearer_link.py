@@ -93,9 +93,10 @@ class WearerLink:
             with contextlib.suppress(queue.Empty):
                 while True:
                     self._send(link, self._wishes.get_nowait())
-            for effect in link.step(_STEP_MS):
-                self._take(effect)
+            effects = link.step(_STEP_MS)
             self._watch(link.client.is_connected)
+            for effect in effects:
+                self._take(effect)
 
     def _send(self, link: RoomLink, wish: page.PageRequest | page.PageCommand) -> None:
         number = next(link.numbers)

@@ -27,7 +27,7 @@ class MetricSpec:
 
 
 _PER_AGENT = ("agents", ("agent", "kind"))
-METRICS = (
+METRICS: tuple[MetricSpec, ...] = (
     MetricSpec("share_edge_uptime_seconds", "Time since the edge started.", "uptime_s"),
     MetricSpec("share_edge_waiting_keyframes", "Keyframes waiting for place recognition.", "waiting"),
     MetricSpec("share_edge_last_solve_age_seconds", "Time since the last pose graph solve.", "last_solve_s"),

@@ -347,7 +347,7 @@ def test_an_edge_that_goes_and_comes_is_told_and_all_heals(site: Path) -> None:
 
 def test_a_page_that_does_not_read_holds_up_nobody(fresh: HeadsetPage) -> None:
     feed = fresh.feed
-    for k in range(40):
+    for k in range(200):
         feed.add_event(ev.RunArrived(f"a{k}-1", f"a{k}", AgentKind.AR, np.eye(4), (0.8, 0.6)))
         feed.add_event(ev.CorrectionArrived(f"a{k}-1", MAP, np.eye(4), 0))
     with paired(fresh, "bob") as bob:
@@ -357,9 +357,10 @@ def test_a_page_that_does_not_read_holds_up_nobody(fresh: HeadsetPage) -> None:
             raw.connect((host, int(port)))
             deaf = PageClient(fresh.endpoint, sock=raw, max_queue=1)
             assert deaf.hello(code=code(fresh), name="ann")["type"] == "welcome"
+            assert soon(lambda: fresh.report()["wearers"].get("ann", {}).get("is_connected"))
             began, is_gone, stamp = time.monotonic(), False, 0
             while time.monotonic() - began < 60 and not is_gone:
-                for k in range(40):
+                for k in range(200):
                     stamp += 1
                     pose = ev.PoseArrived(f"a{k}-1", TrackState.OK, -1, np.eye(4), 0.0, stamp, stamp)
                     feed.add_event(pose)

@@ -65,7 +65,8 @@ def test_an_edge_is_killed_and_its_wearer_goes_on(tmp_path: Path, settings: Path
         ann.send(type="measured", mode="align", frames=140, over_20ms=7, p50_ms=12.5)
         assert soon(lambda: "share_edge_headset_frames{" in fetched(f"{status}metrics"))
         metrics = fetched(f"{status}metrics")
-        assert 'share_edge_headset_lag_p50_seconds{wearer="ann",agent="ann",mode="align"} 0.0125' in metrics
+        labels = '{agent="ann",mode="align",wearer="ann"}'
+        assert f"share_edge_headset_lag_p50_seconds{labels} 0.0125\n" in metrics
         edge.kill()
         assert ann.is_closed()
 
