@@ -23,7 +23,7 @@ from share.headset.certificate import (
     own_certificate,
     session_key,
 )
-from share.headset.measures import HEADSET_TABLE, begin_table
+from share.headset.measures import HEADSET_TABLE, ServerReport, begin_table
 from share.headset.mounts import read_mounts
 from share.headset.page_requests import FOLDER
 from share.headset.wearers import EdgeAccess
@@ -90,7 +90,7 @@ class HeadsetPage:
     ) -> None:
         if find_spec("websockets") is None:
             raise UsageError(f"--headset: {install_hint('websockets', 'headset')}")
-        from share.headset.server import HeadsetSettings, ServerReport
+        from share.headset.server import HeadsetSettings
 
         where, is_encrypted = page_address(address)
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)

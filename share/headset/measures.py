@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from share.errors import UsageError
 from share.files.writing import open_new
 from share.headset.page_messages import PageMeasured
@@ -59,6 +61,20 @@ class MeasureTable:
             self._file = None
             return f"{HEADSET_TABLE}: has {_MAX_ROWS} rows, its limit"
         return ""
+
+
+class ServerReport(msgspec.Struct, omit_defaults=True):
+    """What the server tells its edge: a line for a person, or how it stands."""
+
+    line: str = ""
+    code: str = ""
+    wrong_codes: int = 0
+    pages: int = 0
+    wearers: dict[str, dict[str, Any]] = {}
+
+
+def encode_report(report: ServerReport) -> bytes:
+    return msgspec.json.encode(report)
 
 
 def measured_fields(measured: PageMeasured | None) -> dict[str, Any]:

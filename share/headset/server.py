@@ -19,7 +19,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -28,7 +27,7 @@ from websockets.http11 import Response
 from share.errors import ShareError
 from share.headset import page_messages as page
 from share.headset.certificate import PageCertificate
-from share.headset.measures import MeasureTable, measured_fields
+from share.headset.measures import MeasureTable, ServerReport, encode_report, measured_fields
 from share.headset.mounts import ViewerMount
 from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
 from share.headset.pairing import PairingError
@@ -71,16 +70,6 @@ class HeadsetSettings:
     mounts: dict[str, ViewerMount] = field(default_factory=dict)
     table: Path | None = None
     folder: Path = FOLDER
-
-
-class ServerReport(msgspec.Struct, omit_defaults=True):
-    """What the server tells its edge: a line for a person, or how it stands."""
-
-    line: str = ""
-    code: str = ""
-    wrong_codes: int = 0
-    pages: int = 0
-    wearers: dict[str, dict[str, Any]] = {}
 
 
 class HeadsetServer:
@@ -174,7 +163,7 @@ class HeadsetServer:
                 seat.wake.set()
 
     def _tell(self, report: ServerReport) -> None:
-        self._pipe.send_bytes(msgspec.json.encode(report))
+        self._pipe.send_bytes(encode_report(report))
 
     def _report(self) -> None:
         """Tell the edge that the server lives, and how it stands."""

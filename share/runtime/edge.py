@@ -66,7 +66,7 @@ from share.wire.room_messages import Permission
 
 TICK_MS = 50
 _REPORT_S = 0.1  # period of reports
-_REPORT_SHOWN_S = 0.5  # between reports that an observer is shown
+_POSES_SHOWN_S, _REPORT_SHOWN_S = 0.05, 0.5  # periods of what an observer is shown at least
 MAX_REFUSAL_KINDS = 64  # kinds of refused handshakes that are logged; more are only counted
 _MAX_MESSAGES_PER_STEP = 64  # received before answers, ticks and reports get their turn
 _STALE_REPORT_S = 1.0  # age from which a report is declared stale
@@ -105,7 +105,7 @@ class EdgeRun:
         self._allowed = frozenset(allowed)
         self._settings, self._link, self._on_record = settings, link, on_record
         self._observer = EdgeObservers(*observers)
-        self._report_shown_s = 0.0  # to the observer, monotonic
+        self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
         notify_map, has_keys = partial(self._log_event, "map"), link.agent_names("") is not None
         self._restarts = MapperRestarts(store, settings.merge.enter_m, notify_map, has_keys)
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
@@ -267,8 +267,9 @@ class EdgeRun:
         self._show_state(time.monotonic(), has_news)
 
     def _show_state(self, now_s: float, has_news: bool) -> None:
-        """Show the observer poses as soon as messages have come, and the report where due."""
-        if has_news and self._observer.has_any:
+        """Show poses and report to the observer, where due; poses as soon as messages have come, too."""
+        if self._observer.has_any and (has_news or now_s - self._poses_shown_s >= _POSES_SHOWN_S):
+            self._poses_shown_s = now_s
             self._observer.add_poses(self._state_machine.latest_poses())
         if now_s - self._report_shown_s >= _REPORT_SHOWN_S:
             self._report_shown_s = now_s

@@ -113,16 +113,6 @@ METRICS += (
         "over_20ms",
         *_PER_WEARER,
     ),
-    *(
-        MetricSpec(
-            f"share_edge_headset_lag_{name}_seconds",
-            f"From a pose's stamp until its frame was drawn, {name} of these.",
-            f"{name}_ms",
-            *_PER_WEARER,
-            scale=1e-3,
-        )
-        for name in ("p50", "p95", "p99")
-    ),
     MetricSpec(
         "share_edge_headset_alignment_metres",
         "Standard deviation of where its own space is in the map.",
@@ -143,6 +133,10 @@ _STEPS = ("share_edge_step_seconds", "Duration of a step of the mapper.")
 _POSES = (
     "share_edge_pose_delay_seconds",
     "From the arrival of a frame at the agent until its pose was sent; of the newest 600 poses.",
+)
+_LAGS = (
+    "share_edge_headset_lag_seconds",
+    "From a pose's stamp until its frame was drawn; of a wearer's newest 2 s.",
 )
 _QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
 
@@ -174,6 +168,8 @@ class _Collector:
         yield _info(self.report)
         yield _steps(self.report)
         yield _poses(self.report)
+        if (lags := _lags(self.report)).samples:
+            yield lags
 
 
 def _samples(report: dict[str, Any], row: MetricSpec) -> Iterator[tuple[list[str], float]]:
@@ -211,6 +207,19 @@ def _poses(report: dict[str, Any]) -> Metric:
     for name, agent in _entries(report, "agents"):
         if isinstance(times := _lookup(agent, "pose_ages_ms"), dict) and times.get("n"):
             _add_summary(metric, {"agent": name, "kind": str(_lookup(agent, "kind"))}, times)
+    return metric
+
+
+def _lags(report: dict[str, Any]) -> Metric:
+    """Return the quantiles of each wearer's lag; a page says no more of it."""
+    from prometheus_client.core import Metric
+
+    metric = Metric(*_LAGS, typ="summary")
+    for name, wearer in _entries(report, _PER_WEARER[0]):
+        labels = dict(zip(_PER_WEARER[1], [name, *_labels(wearer, _PER_WEARER[1][1:])], strict=True))
+        for key, quantile in _QUANTILES.items():
+            if (ms := _as_number(_lookup(wearer, f"{key}_ms"))) is not None:
+                metric.add_sample(metric.name, {**labels, "quantile": quantile}, ms * 1e-3)
     return metric
 
 

@@ -79,8 +79,8 @@ tr.gone { color: var(--dim) }
 <h2>Objects</h2><div class="wide"><table id="objects"></table></div>
 <h2>Clients</h2><div class="wide"><table id="clients"></table></div>
 <section id="headset" hidden><h2>Headset page</h2>
-<p>Open <b id="headset-address"></b> in the headset; the code for the next wearer is <b id="code"></b>.
-<span id="fingerprint"></span></p>
+<p><b id="address"></b> code for the next wearer: <b id="code"></b>
+SHA-256: <span id="fingerprint"></span></p>
 <div class="wide"><table id="wearers"></table></div></section>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
@@ -282,18 +282,16 @@ function show(now) {
 function showHeadset(headset) {
   at("headset").hidden = !headset;
   if (!headset) return;
-  at("headset-address").textContent = headset.address;
-  at("code").textContent = headset.code ?? "…";
-  const print = headset.fingerprint;
-  at("fingerprint").textContent = print ? `SHA-256 of its certificate: ${print}` : "";
+  at("address").textContent = headset.address;
+  at("code").textContent = headset.code;
+  at("fingerprint").textContent = headset.fingerprint;
+  const mm = (x, unit) => Number.isFinite(x) ? `${fixed(x, 1)} ${unit}` : "–";
   table("wearers",
-    ["wearer", "device of", "page", "drawn by", "lag p50", "p95", "p99", "over 20 ms", "alignment", "drift"],
-    entries(headset.wearers).map(([name, one]) => ({kind: one.is_connected ? "" : "gone", cells: [
-      name, one.agent, one.is_connected ? "connected" : "away", one.mode,
-      ...[one.p50_ms, one.p95_ms, one.p99_ms].map(ms => Number.isFinite(ms) ? `${fixed(ms, 1)} ms` : "–"),
-      one.frames ? `${fixed(100 * one.over_20ms / one.frames, 1)} %` : "–",
-      Number.isFinite(one.alignment_mm) ? `${fixed(one.alignment_mm, 1)} mm` : "–",
-      Number.isFinite(one.drift_mm_s) ? `${fixed(one.drift_mm_s, 1)} mm/s` : "–"]})));
+    ["wearer", "device of", "page", "mode", "lag p50", "p95", "p99", "over 20 ms", "alignment", "drift"],
+    entries(headset.wearers).map(([name, wearer]) => ({kind: wearer.is_connected ? "" : "gone", cells: [
+      name, wearer.agent, wearer.is_connected ? "connected" : "away", wearer.mode,
+      age(wearer.p50_ms), age(wearer.p95_ms), age(wearer.p99_ms), `${wearer.over_20ms} of ${wearer.frames}`,
+      mm(wearer.alignment_mm, "mm"), mm(wearer.drift_mm_s, "mm/s")]})));
 }
 
 async function refresh() {

@@ -66,7 +66,8 @@ def test_an_edge_is_killed_and_its_wearer_goes_on(tmp_path: Path, settings: Path
         assert soon(lambda: "share_edge_headset_frames{" in fetched(f"{status}metrics"))
         metrics = fetched(f"{status}metrics")
         labels = '{agent="ann",mode="align",wearer="ann"}'
-        assert f"share_edge_headset_lag_p50_seconds{labels} 0.0125\n" in metrics
+        assert f"share_edge_headset_late_frames{labels} 7.0\n" in metrics
+        assert re.search(r'share_edge_headset_lag_seconds\{.*quantile="0.5".*\} 0.0125\n', metrics)
         edge.kill()
         assert ann.is_closed()
 
