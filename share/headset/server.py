@@ -50,8 +50,9 @@ MAX_PAIRING, MAX_CONNECTIONS = 16, 100  # WebSockets that have not paired; conne
 # Of a page: files are asked for one by one; then it drags at 30 Hz, pings and measures.
 _LIMITS = PeerLimits(MAX_PAIRING, MAX_CONNECTIONS, 200, 100.0, 2**18, 2**17)
 SILENT_S = 6.0  # a page pings more often; one that does not has gone
-_HELLO_S, _SEND_S, _CLOSE_S = 10.0, 5.0, 1.0
+_HELLO_S, _SEND_S, _CLOSE_S = 5.0, 5.0, 1.0
 _REPORT_S, _PATH_S = 0.5, 1.0
+_BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
 _UNSENT_BYTES = 2**16  # that wait in a page's connection before the newest is awaited
 _SLEEP_RATIO = 1.0  # the loop uses at most half a core
 _MAX_MOVES = 32  # of maps, that a page was told
@@ -112,6 +113,7 @@ class HeadsetServer:
             create_connection=partial(BoundedConnection, connections=self._connections),
             logger=_silent_logger(),
         )
+        self._listener.listen(_BACKLOG)
         threading.Thread(target=self._read_pipe, args=(loop,), name="feed", daemon=True).start()
         while not self._ended.is_set():
             self._report()

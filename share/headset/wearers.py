@@ -32,7 +32,7 @@ MAX_WEARERS = 8
 ABSENT_S = 6.0  # a page that is away for longer commands no robot: what it sent stops
 _MAX_KNOWN = 256  # names whose newest session is remembered
 _POINTS_LIMIT = (2.0, 0.5)  # times that a page is sent the points of a map, at once and a second
-_COMMAND_LIMIT = (10.0, 5.0)  # goals of a page, and as many stops, at once and a second
+_COMMAND_LIMIT = (5.0, 2.0)  # goals of a page, and as many stops, at once and a second
 _MAX_COMMANDS = 16  # of a wearer, whose state is told again to a page that comes back
 
 

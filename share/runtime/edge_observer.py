@@ -22,7 +22,7 @@ class EdgeObserver(Protocol):
     def add_result(self, result: MapperResult) -> None: ...
 
     def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None:
-        """The newest pose of each present run, by run key, as soon as one may have come and twenty times a second."""
+        """The newest pose of each present run, by run key: as soon as one may have come, and now and then."""
 
     def add_report(self, report: Mapping[str, Any]) -> None:
         """edge.json as it is now, twice a second."""

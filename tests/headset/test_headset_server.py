@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -23,9 +24,11 @@ from share.headset.headset_page import HeadsetPage
 from share.headset.page_messages import PageMeasured
 from share.headset.wearers import EdgeAccess
 from share.mapping.loops import KeyframeKey
+from share.protocol.room_events import MessageWanted, RobotCommanded
+from share.runtime.room_link import RoomLink
 from share.types import AgentKind, TrackState
 from share.view import events as ev
-from share.wire.room_messages import ObjectKind, Permission
+from share.wire.room_messages import Cancel, CommandState, Goto, ObjectKind, Permission, RobotPlace
 
 pytestmark = [
     pytest.mark.skipif(find_spec("websockets") is None, reason="websockets is not installed"),
@@ -190,11 +193,83 @@ def test_a_session_comes_back_and_the_newest_page_has_it(fresh: HeadsetPage) -> 
             assert "another headset has paired" in old.hello(session=welcome["session"])["reason"]
 
 
-def test_a_page_that_does_not_ping_is_let_go(fresh: HeadsetPage) -> None:
-    with paired(fresh, "ann", keeps_alive=False) as ann:
+class Bridge(threading.Thread):
+    """Robot `tb`, which drives to whatever it is sent, until told otherwise."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__()
+        self._link = RoomLink(address, "tb", drives_robot=True)
+        self.goals: list[tuple[float, Goto]] = []  # with when
+        self._is_ended = False
+
+    def __enter__(self) -> Bridge:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_ended = True
+        self.join()
+        self._link.close()
+
+    def is_told(self, within_s: float) -> bool:
+        """Whether it was told to drive so lately."""
+        return bool(self.goals) and time.monotonic() - self.goals[-1][0] < within_s
+
+    def run(self) -> None:
+        while not self._is_ended:
+            for effect in self._link.step(50):
+                if isinstance(effect, RobotCommanded):
+                    self._obey(effect.command)
+            self._link.handle(MessageWanted(RobotPlace(None, MAP, 0.5, 1.0, 0.25, "ready")))
+
+    def _obey(self, command: Goto | Cancel) -> None:
+        if is_stop := isinstance(command, Cancel):
+            self.goals.clear()
+        else:
+            self.goals.append((time.monotonic(), command))
+        text = "stopped" if is_stop else "drives"
+        state = CommandState(command.command, None, command.commander, text, is_stop, is_stop)
+        self._link.handle(MessageWanted(state))
+
+
+def test_a_robot_comes_and_stops_and_all_are_told(fresh: HeadsetPage, edge: RoomServer) -> None:
+    with Bridge(edge.address) as tb, paired(fresh, "ann") as ann, paired(fresh, "bob") as bob:
+        place = {"robot": "tb", "map_id": MAP, "x": 0.5, "y": 1.0, "yaw": 0.25, "text": "ready"}
+        assert ann.wait("robots")["robots"] == [place]
+        ann.send(type="goto", command=9, robot=None, map_id=None, x=1.5, y=2, yaw=None)
+        state = ann.wait("command")
+        assert (state["command"], state["robot"], state["text"]) == (9, "tb", "drives")
+        assert not state["is_final"]
+        seen = bob.wait("command")
+        assert (seen["command"], seen["commander"], seen["robot"]) == (None, "ann", "tb")
+        assert soon(lambda: len(tb.goals) >= 4)  # the server repeats it
+        assert {(goal.x, goal.y, goal.commander) for _, goal in tb.goals} == {(1.5, 2.0, "ann")}
+        bob.send(type="cancel", command=1, robot=None)  # anybody may stop it
+        stopped = bob.wait("command", lambda m: m["command"] == 1)
+        assert stopped["is_final"] and stopped["text"] == "stopped"
+        bob.send(type="cancel", command=1, robot=None)  # the same one again
+        assert bob.wait("command") == stopped
+        ann.send(type="goto", command=20, robot="tb", map_id=None, x=1e5, y=2, yaw=None)
+        assert "more than 1000 m away" in ann.wait("command", lambda m: m["command"] == 20)["text"]
+        for k in range(30):
+            ann.send(type="goto", command=100 + k, robot="tb", map_id=None, x=1, y=2, yaw=None)
+        refused = ann.wait("command", lambda m: "too many" in m["text"])
+        assert refused["text"] == "refused: too many commands at once" and refused["is_final"]
+        ann.send(type="cancel", command=201, robot="tb")
+        assert ann.wait("command", lambda m: m["command"] == 201)["text"] == "stopped"
+
+
+def test_a_page_that_is_silent_is_let_go_and_its_robot_stops(fresh: HeadsetPage, edge: RoomServer) -> None:
+    with Bridge(edge.address) as tb, paired(fresh, "ann", keeps_alive=False) as ann:
         began = time.monotonic()
+        ann.send(type="goto", command=1, robot=None, map_id=None, x=1.5, y=2, yaw=None)
         assert ann.is_closed() and time.monotonic() - began > 4.0
-    assert soon(lambda: "ann" not in fresh.report()["wearers"])
+        assert tb.is_told(within_s=5.0)
+        assert soon(lambda: "ann" not in fresh.report()["wearers"])
+        assert soon(lambda: not tb.is_told(within_s=2.0))
+        with PageClient(fresh.endpoint) as again:  # its session is good all the same
+            assert again.hello(session=ann.seen[0]["session"])["type"] == "welcome"
+        assert not tb.is_told(within_s=2.0)
 
 
 def test_what_is_malformed_or_too_large_ends_only_its_sender(fresh: HeadsetPage) -> None:
@@ -240,7 +315,7 @@ def test_a_hundred_connections_keep_no_wearer_out(fresh: HeadsetPage) -> None:
             assert len(pages) == 16
             ann.send(type="ping", n=1, sent_ms=0)
             assert ann.wait("pong", lambda m: m["n"] == 1)
-            for one in pages:  # whoever says nothing has its place for ten seconds
+            for one in pages:  # whoever says nothing has its place for five seconds
                 assert one.is_closed()
                 ann.send(type="ping", n=2, sent_ms=0)
             with paired(fresh, "bob") as bob:
