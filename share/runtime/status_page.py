@@ -79,7 +79,7 @@ tr.gone { color: var(--dim) }
 <h2>Objects</h2><div class="wide"><table id="objects"></table></div>
 <h2>Clients</h2><div class="wide"><table id="clients"></table></div>
 <section id="headset" hidden><h2>Headset page</h2>
-<p><b id="address"></b> code for the next wearer: <b id="code"></b>
+<p><span id="address"></span>, code for the next wearer: <b id="code"></b><br>
 SHA-256: <span id="fingerprint"></span></p>
 <div class="wide"><table id="wearers"></table></div></section>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
@@ -290,7 +290,8 @@ function showHeadset(headset) {
     ["wearer", "device of", "page", "mode", "lag p50", "p95", "p99", "over 20 ms", "alignment", "drift"],
     entries(headset.wearers).map(([name, wearer]) => ({kind: wearer.is_connected ? "" : "gone", cells: [
       name, wearer.agent, wearer.is_connected ? "connected" : "away", wearer.mode,
-      age(wearer.p50_ms), age(wearer.p95_ms), age(wearer.p99_ms), `${wearer.over_20ms} of ${wearer.frames}`,
+      age(wearer.p50_ms), age(wearer.p95_ms), age(wearer.p99_ms),
+      wearer.frames && `${wearer.over_20ms} of ${wearer.frames}`,
       mm(wearer.alignment_mm, "mm"), mm(wearer.drift_mm_s, "mm/s")]})));
 }
 
