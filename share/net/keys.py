@@ -60,8 +60,7 @@ class EdgeKeys:
 class AllowList:
     """The authorized keys, always as the file says now; none without a file. Safe from several threads.
 
-    public_key_of: a key that is lent for the clients of each name in the list (`share.net.lent_keys`); None:
-    none is."""
+    public_key_of: of each name in the list, the key that is lent for its clients (`share.net.lent_keys`)."""
 
     def __init__(self, path: Path, public_key_of: Callable[[str], str] | None = None) -> None:
         self.path, self.public_key_of = path, public_key_of
@@ -74,19 +73,11 @@ class AllowList:
 
     def agents_for(self, public: str) -> frozenset[str]:
         """Return the names of the agents that this key may act for; none while the file is unreadable."""
-        try:
-            grant = self._grant(public)
-        except UsageError:
-            return frozenset()
-        return frozenset() if grant is None else frozenset(grant.agents)
+        return frozenset(self._grant(public).agents)
 
     def permissions_of(self, public: str) -> frozenset[Permission]:
         """Return what this key may do as a client; nothing while the file is unreadable."""
-        try:
-            grant = self._grant(public)
-        except UsageError:
-            return frozenset()
-        return frozenset() if grant is None else grant.permissions
+        return self._grant(public).permissions
 
     def rights(self) -> dict[str, frozenset[Permission]]:
         """Return the names of all agents, each with what its clients may do by one key or another. Raises
@@ -97,16 +88,18 @@ class AllowList:
                 rights[name] = rights.get(name, frozenset()) | grant.permissions
         return rights
 
-    def _grant(self, public: str) -> Grant | None:
-        """Return what a key is granted, also a lent one. Raises UsageError as `grants`."""
-        grants = self.grants()
-        if public in grants or self.public_key_of is None:
-            return grants.get(public)
-        if self._lent[0] is not grants:  # the file is another
-            rights = self.rights().items()
-            lent = {self.public_key_of(name): Grant(name, (name,), may) for name, may in rights}
-            self._lent = grants, lent
-        return self._lent[1].get(public)
+    def _grant(self, public: str) -> Grant:
+        """Return what a key is granted, also a lent one; nothing while the file is unreadable."""
+        try:
+            grants = self.grants()
+            if public not in grants and self.public_key_of is not None:
+                if self._lent[0] is not grants:  # the file is another
+                    rights, key_of = self.rights().items(), self.public_key_of
+                    self._lent = grants, {key_of(name): Grant(name, (name,), may) for name, may in rights}
+                grants = self._lent[1]
+        except UsageError:
+            grants = {}
+        return grants.get(public, Grant("", ()))
 
     def grants(self) -> dict[str, Grant]:
         """Return all grants by public key. Raises UsageError if the file is unreadable or malformed."""
