@@ -227,7 +227,7 @@ class _EdgePages:
         )
         self._stack.callback(page.close)
         self.observers.append(page.feed)
-        self._addresses.append(f"headset page at {page.scheme}://{page.endpoint}/")
+        self._addresses.append(f"headset page at {page.url}")
         if page.certificate is not None:
             self._addresses.append(f"its certificate has the SHA-256 {page.certificate.fingerprint}")
 

@@ -99,6 +99,8 @@ class HeadsetPage:
         self._listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
+        shown = str(Address(_shown_host(bound.host), bound.port)).removeprefix("tcp://")
+        self.url = f"{self.scheme}://{shown}/"
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
         self.feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
@@ -120,9 +122,8 @@ class HeadsetPage:
     def report(self) -> dict[str, Any]:
         """Return the field `headset` of the edge's report: its address, the code, and its wearers. Safe from
         any thread."""
-        address = f"{self.scheme}://{self.endpoint}/"
         fingerprint = None if self.certificate is None else self.certificate.fingerprint
-        return {"address": address, "fingerprint": fingerprint, **self._report}
+        return {"address": self.url, "fingerprint": fingerprint, **self._report}
 
     def close(self) -> None:
         """End the process."""
@@ -140,6 +141,20 @@ class HeadsetPage:
             else:
                 fields = msgspec.structs.asdict(said)
                 self._report = {key: value for key, value in fields.items() if key != "line"}
+
+
+def _shown_host(host: str) -> str:
+    """Return the host under which a headset reaches what is bound at `host`."""
+    far_away = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # of no machine: RFC 5737, RFC 3849
+    if host not in far_away:
+        return host
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:  # sends nothing
+        try:
+            probe.connect((far_away[host], 9))
+            return str(probe.getsockname()[0])
+        except OSError:  # no network
+            return socket.gethostname()
 
 
 def local_address(endpoint: str) -> str:
