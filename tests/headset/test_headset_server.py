@@ -171,12 +171,13 @@ def test_files_come_with_a_strict_policy(served: HeadsetPage) -> None:
 
 def test_a_session_comes_back_and_the_newest_page_has_it(fresh: HeadsetPage) -> None:
     with PageClient(fresh.endpoint) as first:
-        welcome = first.hello(code=code(fresh), name="ann", agent="ann")
+        used = code(fresh)
+        welcome = first.hello(code=used, name="ann", agent="ann")
         first.wait("edge", lambda m: m["is_connected"])
         first.put(1, 11, 1.0)
         first.wait("receipt")
         with PageClient(fresh.endpoint) as other:
-            answer = other.hello(code=soon(lambda: fresh.report()["code"]), name="ann")
+            answer = other.hello(code=code(fresh, used), name="ann")
             assert "'ann' is connected already" in answer["reason"]
         with PageClient(fresh.endpoint) as second:
             again = second.hello(session=welcome["session"])

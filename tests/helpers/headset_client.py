@@ -25,9 +25,9 @@ def soon(is_true: Callable[[], Any], within_s: float = WAIT_S) -> Any:
     return found
 
 
-def code(page: HeadsetPage) -> str:
-    """The code that the edge shows."""
-    return str(soon(lambda: page.report().get("code")))
+def code(page: HeadsetPage, used: str = "") -> str:
+    """The code that the edge shows, as soon as it is another than the one that is used up."""
+    return str(soon(lambda: page.report().get("code", used) != used and page.report()["code"]))
 
 
 class PageClient:
@@ -102,10 +102,11 @@ class PageClient:
 def paired(page: HeadsetPage, name: str, agent: str | None = None, keeps_alive: bool = True) -> PageClient:
     """A page that has paired as this wearer, and has heard what is told at first."""
     client = PageClient(page.endpoint, page.scheme)
-    answer = client.hello(code=code(page), name=name, agent=agent)
+    shown = code(page)
+    answer = client.hello(code=shown, name=name, agent=agent)
     assert answer["type"] == "welcome", answer
+    code(page, shown)
     if keeps_alive:
         client.keep_alive()
-    soon(lambda: page.report()["code"] != "")
     client.wait("edge", lambda m: m["is_connected"])
     return client

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.children import Child
+from helpers.children import Child, start_agent
 from helpers.map_changes import small_map
 
 from share.store.map_store import MapStore
@@ -85,6 +85,65 @@ def test_an_edge_is_killed_and_its_wearer_goes_on(tmp_path: Path, settings: Path
         assert ann.is_closed()
     assert "headset" not in json.loads((tmp_path / "second" / "edge.json").read_text())
     assert (settings / "headset.secret").stat().st_mode & 0o777 == 0o600
+
+
+def test_wearers_see_agents_that_track_in_their_map(tmp_path: Path, plain_session: Path) -> None:
+    T = [[0.0, -1, 0, 0.01], [1, 0, 0, -0.08], [0, 0, 1, 0.05], [0, 0, 0, 1]]
+    (tmp_path / "headset.yaml").write_text(f"T_body_viewer: {T}\ntimeshift_device_headset: 0.002\n")
+    mount = ("--mount", f"ann={tmp_path}")
+    edge, page, status = start(tmp_path, "edge", "http://127.0.0.1:0", *mount)
+    address = edge.wait_for(r"listening on (tcp://\S+?),")[1]
+
+    used = [""]
+
+    def wearer(name: str) -> tuple[PageClient, dict[str, Any]]:
+        def shown() -> Any:
+            code = json.loads(fetched(f"{status}snapshot.json"))["headset"]["code"]
+            return code != used[-1] and code
+
+        code, client = soon(shown), PageClient(page)
+        used.append(code)
+        welcome = client.hello(code=code, name=name, agent=name)
+        client.keep_alive()
+        return client, welcome
+
+    edge.wait_for("the code for the next wearer")
+    ann, welcome = wearer("ann")
+    assert welcome["T_body_viewer"] == [x for row in T for x in row] and welcome["mount_timeshift_ms"] == 2.0
+    bob, welcome = wearer("bob")
+    assert welcome["T_body_viewer"] is None
+    began_ms = time.monotonic_ns() / 1e6
+    agents = [
+        start_agent(tmp_path, name, plain_session / s, address)
+        for name, s in (("ann", "ar1"), ("bob", "ar2"))
+    ]
+    try:
+        of_bob: list[dict[str, Any]] = []
+
+        def is_placed(message: dict[str, Any]) -> bool:
+            """Whether bob's pose has come with a map and how it moves."""
+            found = [one for one in message["poses"] if one["agent"] == "bob" and one["velocity"]]
+            of_bob.extend(one for one in found if one["map_id"])
+            return len(of_bob) >= 5
+
+        ann.wait("poses", is_placed)
+        for one in of_bob:
+            assert began_ms < one["t_ms"] < time.monotonic_ns() / 1e6 and one["state"] in ("OK", "WEAK")
+            assert max(map(abs, one["velocity"])) < 3 and max(map(abs, one["angular_velocity"])) < 4
+        assert of_bob[-1]["t_ms"] > of_bob[0]["t_ms"]
+        ann.send(type="points", map_id=of_bob[-1]["map_id"])
+        assert ann.wait("points")["count"] > 50
+        bob.put(1, 5, 1.0)  # in the map of his agent
+        assert bob.wait("receipt")["reason"] == ""
+        seen = ann.wait("objects", lambda m: bool(m["objects"]))
+        assert (seen["objects"][0]["owner"], seen["objects"][0]["map_id"]) == ("bob", of_bob[-1]["map_id"])
+        ann.wait("poses", lambda m: any(one["state"] == "GONE" for one in m["poses"]))  # they have ended
+    finally:
+        for client in (ann, bob):
+            client.close()
+        for agent in agents:
+            agent.kill()
+        edge.kill()
 
 
 def _map_of(store: MapStore) -> str:
