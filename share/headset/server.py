@@ -130,11 +130,14 @@ class HeadsetServer:
         """Apply the events of the edge, a message at a time, until it ends."""
         with contextlib.suppress(EOFError, OSError, RuntimeError):
             while (data := self._pipe.recv_bytes()) != END:
-                events = pickle.loads(data)  # of our own parent process
-                self._apply_now(loop, events)
-                for event in events:
+                waiting = []
+                for event in pickle.loads(data):  # of our own parent process
+                    waiting.append(event)
                     if isinstance(event, SessionBegun) and event.map_file is not None:
-                        self._load(loop, event.map_file)
+                        self._apply_now(loop, waiting)
+                        self._load(loop, event.map_file)  # before what has come since
+                        waiting = []
+                self._apply_now(loop, waiting)
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(self._ended.set)
 

@@ -49,12 +49,21 @@ class _RoomAgent:
     def name(self) -> str:
         return self.path.shown.name
 
+    @property
+    def is_there(self) -> bool:
+        """Whether it is there and has said where it is, or that it is lost; runs of a map file have not."""
+        return bool(self.time_ns) and self.state != GONE
+
     def add_pose(self, event: ev.PoseArrived) -> None:
+        """Take a pose; not one whose keyframe has not come yet: the one before is shown so long."""
+        time_ns = self.times.time_of(event.stamp_ns, event.received_ns, event.age_ms or 0.0)
+        keyframe = self.path.keyframes.get(event.keyframe)
+        if event.state.has_pose and keyframe is None and event.keyframe >= 0:
+            return
+        self.time_ns = time_ns
         self.path.add_pose(event)
         self.path.forget_oldest_path()
-        self.time_ns = self.times.time_of(event.stamp_ns, event.received_ns, event.age_ms or 0.0)
-        keyframe = self.path.keyframes.get(event.keyframe)
-        if not event.state.has_pose or (keyframe is None and event.keyframe >= 0):
+        if not event.state.has_pose:
             self.motions.forget()
             self.T_odom_body = self.motion = None
             return
@@ -174,17 +183,18 @@ class SharedRoom:
 
     def agents(self) -> list[dict[str, str]]:
         """Return name and kind of the agents that are there."""
-        shown = (run.path.shown for run in self._newest().values() if run.state != GONE)
+        shown = (run.path.shown for run in self._newest().values() if run.is_there)
         return [{"name": one.name, "kind": str(one.kind)} for one in shown]
 
     def take_poses(self, has_paths: bool = False) -> list[dict[str, Any]]:
         """Return the newest pose of each agent that has another than at the last call."""
         changed, self._changed = self._changed, set()
-        return [run.fields(has_paths) for key, run in self._newest().items() if key in changed]
+        newest = self._newest().items()
+        return [run.fields(has_paths) for key, run in newest if key in changed and run.time_ns]
 
     def poses(self) -> list[dict[str, Any]]:
-        """Return the newest pose of every agent, with its path."""
-        return [run.fields(True) for run in self._newest().values()]
+        """Return the newest pose of every agent that is there, with its path."""
+        return [run.fields(True) for run in self._newest().values() if run.is_there]
 
     def take_moves(self) -> list[AgentMoved]:
         """Return how agents changed their map since the last call."""

@@ -52,7 +52,8 @@ def test_a_pose_is_in_the_map_with_its_time_and_motion() -> None:
     assert told["quaternion"] == pytest.approx([0, 0, np.sqrt(0.5), np.sqrt(0.5)], abs=1e-5)
     assert told["t_ms"] == 1099 + 100  # the way took 100 ms, by two clocks
     assert told["velocity"] == pytest.approx([0, 1, 0], abs=1e-4) and told["angular_velocity"] == [0, 0, 0]
-    assert room.take_poses() == [] and len(room.poses()) == 2
+    (again,) = room.poses()  # the robot has not said yet where it is
+    assert room.take_poses() == [] and {k: v for k, v in again.items() if k != "path"} == told
     room.apply(ev.AgentsReported({"ann": {"run": "ann-1", "gone": False, "state": "OK", "rtt_ms": 20.0}}))
     room.pose("ann-1", at(0.132), 1132)
     assert room.take_poses()[0]["t_ms"] == 1132 + 90
@@ -61,6 +62,7 @@ def test_a_pose_is_in_the_map_with_its_time_and_motion() -> None:
 def test_who_has_no_pose_or_is_gone_has_no_place() -> None:
     room = Playing()
     room.pose("ann-1", EYE, 0)
+    room.pose("tb-1", EYE, 0)
     assert room.take_poses()[0]["position"] == [0, 0, 0]
     room.pose("ann-1", EYE, 33, TrackState.LOST)
     (told,) = room.take_poses()
@@ -74,6 +76,26 @@ def test_who_has_no_pose_or_is_gone_has_no_place() -> None:
     room.apply(ev.AgentsReported({"ann": entry | {"gone": False, "state": "SILENT"}}))
     (told,) = room.take_poses()
     assert (told["state"], told["map_id"]) == ("SILENT", "ANN")
+
+
+def test_a_pose_whose_keyframe_has_not_come_waits_for_it() -> None:
+    room = Playing()
+    room.pose("ann-1", at(1), 0)
+    room.take_poses()
+    room.pose("ann-1", at(9), 33, keyframe=7)
+    assert [told["position"][0] for told in room.take_poses()] == [1]
+    room.apply(ev.KeyframeArrived(KeyframeKey("ann-1", 7), False, at(2), np.ones((3, 3), np.float32)))
+    room.pose("ann-1", at(1), 66, keyframe=7)
+    assert [told["position"][0] for told in room.take_poses()] == [3]
+
+
+def test_runs_of_a_map_file_are_not_there() -> None:
+    room = SharedRoom()
+    room.apply(ev.RunArrived("old-1", "old", AgentKind.AR, EYE, (0.8, 0.6)))
+    room.apply(ev.KeyframeArrived(KeyframeKey("old-1", 0), True, EYE, np.ones((3, 3), np.float32)))
+    room.apply(ev.MapsSolved(SavePoses((KeyframeKey("old-1", 0),), np.array([at(5)]), ("M",))))
+    room.apply(ev.AgentsReported({"old": {"run": "old-1", "gone": True, "state": "OK", "rtt_ms": None}}))
+    assert room.agents() == room.poses() == room.take_poses() == [] and len(room.points("M")) == 3
 
 
 def test_of_an_agent_that_came_again_the_newest_run_counts() -> None:
