@@ -77,10 +77,11 @@ class PageClient:
         """The next message of this kind that is it."""
         deadline = time.monotonic() + WAIT_S
         while time.monotonic() < deadline:
-            message = self.hear(max(0.01, deadline - time.monotonic()))
-            if message["type"] == kind and is_it(message):
-                return message
-        raise AssertionError(f"no {kind}")
+            with suppress(TimeoutError):
+                message = self.hear(max(0.01, deadline - time.monotonic()))
+                if message["type"] == kind and is_it(message):
+                    return message
+        raise AssertionError(f"no {kind}; the last said: {self.seen[-5:]}")
 
     def is_closed(self, within_s: float = WAIT_S) -> bool:
         """Whether the server closes it, whatever it says before."""
