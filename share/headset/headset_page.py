@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
@@ -27,7 +28,7 @@ from share.headset.measures import HEADSET_TABLE, ServerReport, begin_table
 from share.headset.mounts import read_mounts
 from share.headset.page_requests import FOLDER
 from share.headset.wearers import EdgeAccess
-from share.net.http_guard import http_address, listen
+from share.net.http_guard import listen, served_address
 from share.net.transport import Address, parse_address
 from share.view.feed import ViewFeed
 from share.view.page_process import PageProcess, last_words, silence_output
@@ -35,7 +36,6 @@ from share.view.page_process import PageProcess, last_words, silence_output
 COLLECT_S = 1 / 60  # between messages to the process: poses are relayed at 30 Hz
 _NICENESS = 5  # below the edge, above the live room
 _TITLE = "headset page"
-_ANY = "a token that is not used"
 
 
 def page_address(text: str) -> tuple[Address, bool]:
@@ -44,7 +44,7 @@ def page_address(text: str) -> tuple[Address, bool]:
     where = rest if marker else text
     if marker and scheme not in ("http", "https"):
         raise UsageError(f"--headset {text}: expected HOST:PORT, or http://127.0.0.1:PORT for `adb reverse`")
-    address = http_address("--headset", where.rstrip("/"), _ANY)  # a code is asked for, not a token
+    address = served_address(where.rstrip("/"))
     if scheme == "http" and marker and not address.local:
         raise UsageError(
             f"--headset {text}: a browser gives WebXR to an encrypted page only; without http:// it is one"
@@ -105,7 +105,14 @@ class HeadsetPage:
         self._report: dict[str, Any] = {}
         self.feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
         settings = HeadsetSettings(
-            access, where.host, self.certificate, session_key(default_folder()), known_mounts, table, folder
+            access,
+            where.host,
+            self.certificate,
+            session_key(default_folder()),
+            time.monotonic(),
+            known_mounts,
+            table,
+            folder,
         )
         arguments = (self._listener, settings)
         self._process = PageProcess(_TITLE, _run, arguments, notify, self.feed.reconnect, self._hear)

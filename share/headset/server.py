@@ -61,13 +61,14 @@ _MAX_MOVES = 32  # of maps, that a page was told
 @dataclass(frozen=True)
 class HeadsetSettings:
     """What the server is started with. certificate: None: plain HTTP, of this machine alone. host: that it
-    listens on. session_key: that signs sessions. table: where what pages measure is written. folder: with the
-    page's files."""
+    listens on. session_key: that signs sessions. began_s: when the page began, monotonic. table: where what
+    pages measure is written. folder: with the page's files."""
 
     access: EdgeAccess
     host: str
     certificate: PageCertificate | None
     session_key: bytes = field(repr=False)
+    began_s: float
     mounts: dict[str, ViewerMount] = field(default_factory=dict)
     table: Path | None = None
     folder: Path = FOLDER
@@ -85,7 +86,6 @@ class HeadsetServer:
         self._connections = PeerConnections(_LIMITS)
         self._room, self._wearers = SharedRoom(), WearerRegistry(settings.access, settings.session_key)
         self._table = MeasureTable(settings.table)
-        self._start_s = time.monotonic()
         self._path_due_s, self._code_shown = 0.0, ""
         self._ended = asyncio.Event()
 
@@ -298,7 +298,7 @@ class HeadsetServer:
 
     def _take_measured(self, wearer: Wearer, measured: page.PageMeasured) -> None:
         wearer.measured = measured
-        t_s, now_ns = time.monotonic() - self._start_s, time.monotonic_ns()
+        t_s, now_ns = time.monotonic() - self._settings.began_s, time.monotonic_ns()
         if line := self._table.add(t_s, wearer.name, wearer.session.agent, measured, now_ns):
             self._tell(ServerReport(line))
 

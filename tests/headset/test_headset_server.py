@@ -20,10 +20,11 @@ import pytest
 from helpers.room_server import MAP, RoomServer
 
 from share.errors import ShareError, TransportError, UsageError
-from share.headset.headset_page import HeadsetPage
+from share.headset.headset_page import HeadsetPage, local_address, page_address
 from share.headset.page_messages import PageMeasured
 from share.headset.wearers import EdgeAccess
 from share.mapping.loops import KeyframeKey
+from share.net.transport import Address
 from share.protocol.room_events import MessageWanted, RobotCommanded
 from share.runtime.room_link import RoomLink
 from share.types import AgentKind, TrackState
@@ -449,6 +450,16 @@ def test_a_page_that_does_not_read_holds_up_nobody(fresh: HeadsetPage) -> None:
                 is_gone = not fresh.report()["wearers"].get("ann", {"is_connected": False})["is_connected"]
                 time.sleep(0.02)
             assert is_gone
+
+
+def test_an_address_is_that_of_this_machine_unless_it_says_more() -> None:
+    assert page_address("8443") == (Address("127.0.0.1", 8443), True)
+    assert page_address("0.0.0.0:8443") == (Address("0.0.0.0", 8443), True)
+    assert page_address("https://[::1]:8443/") == (Address("::1", 8443), True)
+    assert page_address("http://localhost:8443") == (Address("127.0.0.1", 8443), False)
+    assert local_address("tcp://0.0.0.0:5555") == "tcp://127.0.0.1:5555"
+    assert local_address("tcp://[::]:5555") == "tcp://[::1]:5555"
+    assert local_address("tcp://192.168.1.5:5555") == "tcp://192.168.1.5:5555"
 
 
 def test_an_address_that_cannot_be_is_one_line(site: Path, served: HeadsetPage, tmp_path: Path) -> None:
