@@ -21,6 +21,7 @@ from helpers.edge_in_process import Link, Thread
 from helpers.edge_sim import Person, Town, walls
 from helpers.hellos import hello_of
 from helpers.plain_walk import RIG
+from helpers.reports import headset_report
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.cameras.live import LiveSource
@@ -181,7 +182,7 @@ def test_keys_of_health_are_those_that_the_code_writes(run: Run) -> None:
 
 @pytest.mark.long
 def test_metrics_and_their_labels_are_those_that_the_code_writes(run: Run) -> None:
-    text = render_metrics(run.report)[0].decode()
+    text = render_metrics(run.report | {"headset": headset_report()})[0].decode()
     written: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(text):
         name = family.name + ("_total" if family.type == "counter" else "")

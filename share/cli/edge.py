@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -18,11 +18,14 @@ if TYPE_CHECKING:
     from contextlib import ExitStack
 
     from share.cli.stderr import Stderr
+    from share.headset.headset_page import HeadsetPage
+    from share.headset.wearers import EdgeAccess
     from share.net.keys import EdgeKeys
     from share.runtime.edge import EdgeRun
     from share.runtime.edge_observer import EdgeObserver
     from share.store.map_store import MapStore
     from share.view.viewer import LiveRoom
+    from share.wire.room_messages import Permission
 
 
 @click.command()
@@ -40,6 +43,26 @@ if TYPE_CHECKING:
     "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
 )
 @click.option("--view", metavar="[H:]P", help="Show the room live in 3D here (needs viser).")
+@click.option(
+    "--headset",
+    metavar="[http://]H:P",
+    help="Serve the page that headsets wear here, encrypted; with http:// for adb reverse.",
+)
+@click.option(
+    "--headset-cert",
+    metavar="FILE",
+    type=options.PATH,
+    help="Certificate of --headset.  [default: our own, made on first use]",
+)
+@click.option("--headset-key", metavar="FILE", type=options.PATH, help="Key of --headset-cert.")
+@click.option(
+    "--mount",
+    "mounts",
+    metavar="NAME=FILE",
+    multiple=True,
+    help="Where the headset of agent NAME sits on its device: headset.yaml of share calibrate headset. May "
+    "be repeated.",
+)
 @click.option(
     "--http-token",
     metavar="FILE",
@@ -65,6 +88,10 @@ def edge(
     map_file: Path | None,
     http: str | None,
     view: str | None,
+    headset: str | None,
+    headset_cert: Path | None,
+    headset_key: Path | None,
+    mounts: tuple[str, ...],
     http_token: Path | None,
     allow: tuple[str, ...],
     out: Path | None,
@@ -99,6 +126,10 @@ def edge(
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
+    if headset is None and (headset_cert or headset_key or mounts):
+        raise UsageError("--headset-cert, --headset-key, --mount: they are for --headset; give it too")
+    if headset is not None and is_streamed:
+        raise UsageError("--headset: policy streamed builds no map; leave it out, or choose another policy")
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
     if http_token is not None and http is None and view is None:
         raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
@@ -108,6 +139,9 @@ def edge(
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
         # before any process starts: the port may be in use
         pages = _EdgePages(stack, stderr, http, view, token)
+        if headset is not None:
+            files = _HeadsetFiles(headset_cert, headset_key, mounts, out)
+            pages.add_headset(headset, _edge_access(link.endpoint, edge_key_pair, allowed), files)
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         on_event = partial(_print_event, stderr, verbose)
         run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed)
@@ -122,8 +156,35 @@ def edge(
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
+class _HeadsetFiles(NamedTuple):
+    """Files of the headset page; out: folder for what it measures."""
+
+    certificate: Path | None
+    key: Path | None
+    mounts: tuple[str, ...]
+    out: Path | None
+
+
+def _edge_access(endpoint: str, keys: EdgeKeys | None, allowed: frozenset[Permission]) -> EdgeAccess:
+    """Return how the clients of wearers reach this edge; with keys, by ones that it lends them."""
+    import secrets
+
+    from share.headset.headset_page import local_address
+    from share.headset.wearers import EdgeAccess
+    from share.net.lent_keys import LentKeys
+
+    address = local_address(endpoint)
+    if keys is None:
+        return EdgeAccess(address, allowed)
+    secret = secrets.token_bytes(32)
+    lent = LentKeys(secret)
+    keys.allowed.public_key_of = lambda name: lent.pair(name).public
+    return EdgeAccess(address, allowed, keys.allowed.path.parent, keys.own.public, secret)
+
+
 class _EdgePages:
-    """The status page and the live room of an edge, as far as they are asked for. run: set once it is made.
+    """The status page, the live room and the headset page of an edge, as far as they are asked for. run: set
+    once it is made.
 
     Raises UsageError for an address that is none, TransportError for a port in use."""
 
@@ -137,7 +198,9 @@ class _EdgePages:
         self.run: EdgeRun | None = None
         self.observers: list[EdgeObserver] = []
         self._stderr, self._addresses = stderr, list[str]()
+        self._stack = stack
         self._room: LiveRoom | None = None
+        self._headset: HeadsetPage | None = None
         if http is not None:
             plan = Plan()
             status = StatusServer(http, self._report, stderr.print_line, token, plan.report)
@@ -150,17 +213,38 @@ class _EdgePages:
             self.observers.append(self._room.feed)
             self._addresses.append(f"live room at http://{self._room.endpoint}/")
 
+    def add_headset(self, address: str, access: EdgeAccess, files: _HeadsetFiles) -> None:
+        from share.headset.headset_page import HeadsetPage
+
+        self._headset = page = HeadsetPage(
+            address,
+            access,
+            certificate=files.certificate,
+            key=files.key,
+            mounts=files.mounts,
+            out=files.out,
+            notify=self._stderr.print_line,
+        )
+        self._stack.callback(page.close)
+        self.observers.append(page.feed)
+        self._addresses.append(f"headset page at {page.url}")
+        if page.certificate is not None:
+            self._addresses.append(f"its certificate has the SHA-256 {page.certificate.fingerprint}")
+
     def _report(self) -> dict[str, Any]:
-        """Return the report of the edge, if it runs yet, with the address of a live room that lives."""
+        """Return the report of the edge, if it runs yet, with what its pages tell that live."""
         report = {} if self.run is None else self.run.report()
-        if self._room is None or not self._room.is_alive:
-            return report
-        return report | {"live_room": self._room.endpoint}
+        if self._room is not None and self._room.is_alive:
+            report = report | {"live_room": self._room.endpoint}
+        if self._headset is not None and self._headset.is_alive:
+            report = report | {"headset": self._headset.report()}
+        return report
 
     def print_addresses(self, token_file: Path | None) -> None:
         password = "" if token_file is None else f"  (any name; the password is in {token_file})"
         for one in self._addresses:
-            self._stderr.print_line(one + password)
+            is_guarded = one.startswith(("status", "live room"))
+            self._stderr.print_line(one + password if is_guarded else one)
 
 
 def _open_map(stderr: Stderr, path: Path) -> MapStore:

@@ -1,1 +1,2 @@
-"""The headset's side of the shared map: where the headset's own space is in it."""
+"""The page of the edge that headsets show: its server, who may use it, and where a headset's own space is in
+the map (extra headset; docs/do/headset.md)."""

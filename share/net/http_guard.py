@@ -133,16 +133,21 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def http_address(option: str, text: str, token: str | None) -> Address:
-    """Return the address that an option names: HOST:PORT, or a PORT of this machine alone.
-
-    Raises UsageError if it is malformed, or reachable from other machines without a token.
-    """
+def served_address(text: str) -> Address:
+    """Return the address of HOST:PORT, or of a PORT of this machine alone. Raises UsageError."""
     try:
-        address = parse_address(f"tcp://127.0.0.1:{text}" if text.isdigit() else f"tcp://{text}", True)
+        return parse_address(f"tcp://127.0.0.1:{text}" if text.isdigit() else f"tcp://{text}", True)
     except UsageError:
         wrong = f"'{text}' is not an address to serve at; expected HOST:PORT, such as 127.0.0.1:8080"
         raise UsageError(wrong) from None
+
+
+def http_address(option: str, text: str, token: str | None) -> Address:
+    """Return the address that an option names, as `served_address`.
+
+    Raises UsageError if it is malformed, or reachable from other machines without a token.
+    """
+    address = served_address(text)
     if token is None and not address.local:
         raise UsageError(
             f"{option} {text}: others could read it; add --http-token FILE (made if it is not there), "

@@ -14,7 +14,7 @@ import re
 import socket
 import stat
 import struct
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -58,11 +58,14 @@ class EdgeKeys:
 
 
 class AllowList:
-    """The authorized keys, always as the file says now; none without a file. Safe from several threads."""
+    """The authorized keys, always as the file says now; none without a file. Safe from several threads.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    public_key_of: of each name in the list, the key that is lent for its clients (`share.net.lent_keys`)."""
+
+    def __init__(self, path: Path, public_key_of: Callable[[str], str] | None = None) -> None:
+        self.path, self.public_key_of = path, public_key_of
         self._cached: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
+        self._lent: tuple[dict[str, Grant], dict[str, Grant]] = {}, {}  # of which grants, by lent key
 
     def names_by_key(self) -> dict[str, str]:
         """Return machine names by public key. Raises UsageError if the file is unreadable or malformed."""
@@ -70,19 +73,33 @@ class AllowList:
 
     def agents_for(self, public: str) -> frozenset[str]:
         """Return the names of the agents that this key may act for; none while the file is unreadable."""
-        try:
-            grant = self.grants().get(public)
-        except UsageError:
-            return frozenset()
-        return frozenset() if grant is None else frozenset(grant.agents)
+        return frozenset(self._grant(public).agents)
 
     def permissions_of(self, public: str) -> frozenset[Permission]:
         """Return what this key may do as a client; nothing while the file is unreadable."""
+        return self._grant(public).permissions
+
+    def rights(self) -> dict[str, frozenset[Permission]]:
+        """Return the names of all agents, each with what its clients may do by one key or another. Raises
+        UsageError as `grants`."""
+        rights: dict[str, frozenset[Permission]] = {}
+        for grant in self.grants().values():
+            for name in grant.agents:
+                rights[name] = rights.get(name, frozenset()) | grant.permissions
+        return rights
+
+    def _grant(self, public: str) -> Grant:
+        """Return what a key is granted, also a lent one; nothing while the file is unreadable."""
         try:
-            grant = self.grants().get(public)
+            grants = self.grants()
+            if public not in grants and self.public_key_of is not None:
+                if self._lent[0] is not grants:  # the file is another
+                    rights, key_of = self.rights().items(), self.public_key_of
+                    self._lent = grants, {key_of(name): Grant(name, (name,), may) for name, may in rights}
+                grants = self._lent[1]
         except UsageError:
-            return frozenset()
-        return frozenset() if grant is None else grant.permissions
+            grants = {}
+        return grants.get(public, Grant("", ()))
 
     def grants(self) -> dict[str, Grant]:
         """Return all grants by public key. Raises UsageError if the file is unreadable or malformed."""

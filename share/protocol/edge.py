@@ -175,6 +175,7 @@ class EdgeProtocol:
 
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1
+        peer.rtt_ms = evaluation.rtt_ms or None  # 0: before its first round trip
         report = AgentReport(
             kind=peer.hello.kind,
             evaluation=evaluation,

@@ -147,6 +147,7 @@ class Peer(Sender):
     has_sent: bool = True  # a message in this session
     joined_ns: int | None = None  # first message in this session
     latest_pose: PoseUpdate | None = None
+    rtt_ms: float | None = None  # that it reports
     pending_saves: int = 0
     grant: RateGrant | None = None  # the last that was sent
     computation: ComputationDelay = field(default_factory=ComputationDelay)
@@ -199,6 +200,7 @@ class Peer(Sender):
             "run": self.key,
             **status,
             "gone": self.is_gone,
+            "rtt_ms": None if self.rtt_ms is None else round(self.rtt_ms, 3),
             **{name: self.counts[name] for name in _REPORTED_COUNTS},
             "refused_messages": self.refusals.count,
             "last_refusal": self.refusals.reason or None,

@@ -66,7 +66,7 @@ from share.wire.room_messages import Permission
 
 TICK_MS = 50
 _REPORT_S = 0.1  # period of reports
-_POSES_SHOWN_S, _REPORT_SHOWN_S = 0.05, 0.5  # periods of what an observer is shown
+_POSES_SHOWN_S, _REPORT_SHOWN_S = 0.05, 0.5  # periods of what an observer is shown at least
 MAX_REFUSAL_KINDS = 64  # kinds of refused handshakes that are logged; more are only counted
 _MAX_MESSAGES_PER_STEP = 64  # received before answers, ticks and reports get their turn
 _STALE_REPORT_S = 1.0  # age from which a report is declared stale
@@ -247,10 +247,12 @@ class EdgeRun:
     # ------------------------------------------------------------------ the loop
 
     def _step(self) -> None:
+        has_news = False
         for i in range(_MAX_MESSAGES_PER_STEP):
             message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
+            has_news = True
             names = self._link.agent_names(message.key)
             may = self._allowed if names is None else self._link.permissions(message.key)
             self._handle(PeerMessageReceived(message.peer, message.frames, names, message.key, may))
@@ -262,11 +264,11 @@ class EdgeRun:
             self._restart_mapping(self._restart_reason)
         if time.monotonic() >= self._report_due_s:
             self._try_to_report()
-        self._show_state(time.monotonic())
+        self._show_state(time.monotonic(), has_news)
 
-    def _show_state(self, now_s: float) -> None:
-        """Show poses and report to the observer, where due."""
-        if now_s - self._poses_shown_s >= _POSES_SHOWN_S:
+    def _show_state(self, now_s: float, has_news: bool) -> None:
+        """Show poses and report to the observer, where due; poses as soon as messages have come, too."""
+        if self._observer.has_any and (has_news or now_s - self._poses_shown_s >= _POSES_SHOWN_S):
             self._poses_shown_s = now_s
             self._observer.add_poses(self._state_machine.latest_poses())
         if now_s - self._report_shown_s >= _REPORT_SHOWN_S:

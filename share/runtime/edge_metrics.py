@@ -27,7 +27,7 @@ class MetricSpec:
 
 
 _PER_AGENT = ("agents", ("agent", "kind"))
-METRICS = (
+METRICS: tuple[MetricSpec, ...] = (
     MetricSpec("share_edge_uptime_seconds", "Time since the edge started.", "uptime_s"),
     MetricSpec("share_edge_waiting_keyframes", "Keyframes waiting for place recognition.", "waiting"),
     MetricSpec("share_edge_last_solve_age_seconds", "Time since the last pose graph solve.", "last_solve_s"),
@@ -97,11 +97,46 @@ METRICS = (
         "unjoined.bad_messages",
     ),
 )
+_PER_WEARER = ("headset.wearers", ("wearer", "agent", "mode"))
+METRICS += (
+    MetricSpec("share_edge_headset_pages", "Headset pages that are connected.", "headset.pages"),
+    MetricSpec("share_edge_headset_wrong_codes_total", "Wrong codes that were given.", "headset.wrong_codes"),
+    MetricSpec(
+        "share_edge_headset_connected", "1 if the wearer's page is connected.", "is_connected", *_PER_WEARER
+    ),
+    MetricSpec(
+        "share_edge_headset_frames", "Frames that its page drew in its newest 2 s.", "frames", *_PER_WEARER
+    ),
+    MetricSpec(
+        "share_edge_headset_late_frames",
+        "Frames of these that were drawn over 20 ms after their pose's stamp.",
+        "over_20ms",
+        *_PER_WEARER,
+    ),
+    MetricSpec(
+        "share_edge_headset_alignment_metres",
+        "Standard deviation of where its own space is in the map.",
+        "alignment_mm",
+        *_PER_WEARER,
+        scale=1e-3,
+    ),
+    MetricSpec(
+        "share_edge_headset_drift_metres_per_second",
+        "How fast that moves.",
+        "drift_mm_s",
+        *_PER_WEARER,
+        scale=1e-3,
+    ),
+)
 _INFO = ("share_edge_agent_info", "State of an agent as labels; always 1.", ("agent", "kind", "state", "map"))
 _STEPS = ("share_edge_step_seconds", "Duration of a step of the mapper.")
 _POSES = (
     "share_edge_pose_delay_seconds",
     "From the arrival of a frame at the agent until its pose was sent; of the newest 600 poses.",
+)
+_LAGS = (
+    "share_edge_headset_lag_seconds",
+    "From a pose's stamp until its frame was drawn; of a wearer's newest 2 s.",
 )
 _QUANTILES = {"p50": "0.5", "p95": "0.95", "p99": "0.99"}
 
@@ -133,6 +168,8 @@ class _Collector:
         yield _info(self.report)
         yield _steps(self.report)
         yield _poses(self.report)
+        if (lags := _lags(self.report)).samples:
+            yield lags
 
 
 def _samples(report: dict[str, Any], row: MetricSpec) -> Iterator[tuple[list[str], float]]:
@@ -170,6 +207,19 @@ def _poses(report: dict[str, Any]) -> Metric:
     for name, agent in _entries(report, "agents"):
         if isinstance(times := _lookup(agent, "pose_ages_ms"), dict) and times.get("n"):
             _add_summary(metric, {"agent": name, "kind": str(_lookup(agent, "kind"))}, times)
+    return metric
+
+
+def _lags(report: dict[str, Any]) -> Metric:
+    """Return the quantiles of each wearer's lag; a page says no more of it."""
+    from prometheus_client.core import Metric
+
+    metric = Metric(*_LAGS, typ="summary")
+    for name, wearer in _entries(report, _PER_WEARER[0]):
+        labels = dict(zip(_PER_WEARER[1], [name, *_labels(wearer, _PER_WEARER[1][1:])], strict=True))
+        for key, quantile in _QUANTILES.items():
+            if (ms := _as_number(_lookup(wearer, f"{key}_ms"))) is not None:
+                metric.add_sample(metric.name, {**labels, "quantile": quantile}, ms * 1e-3)
     return metric
 
 

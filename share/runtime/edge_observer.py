@@ -22,7 +22,7 @@ class EdgeObserver(Protocol):
     def add_result(self, result: MapperResult) -> None: ...
 
     def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None:
-        """The newest pose of each present run, by run key, twenty times a second."""
+        """The newest pose of each present run, by run key: as soon as one may have come, and now and then."""
 
     def add_report(self, report: Mapping[str, Any]) -> None:
         """edge.json as it is now, twice a second."""
@@ -32,7 +32,7 @@ class EdgeObservers(EdgeObserver):
     """Shows all of some observers, perhaps none, what happens."""
 
     def __init__(self, *observers: EdgeObserver) -> None:
-        self._observers = observers
+        self._observers, self.has_any = observers, bool(observers)
 
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         for one in self._observers:

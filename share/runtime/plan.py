@@ -22,7 +22,7 @@ _STEP_M, _MAX_STEP_M = 0.1, 0.2  # between points of a path; more, and it cuts a
 _MAX_POINTS = 600  # of a segment's path; beyond, every second is left out, and then the oldest are
 _MAX_SEGMENTS = 8  # of a run; the oldest are forgotten
 _KEPT_KEYFRAMES = 64  # newest, of a run; poses are relative to one of them
-_UPDATE_EVERY = 4  # poses come twenty times a second
+_UPDATE_EVERY = 4  # calls: poses are shown twenty times a second or more
 
 
 @dataclass

@@ -25,6 +25,8 @@ a { color: inherit }
 td i { display: inline-block; width: .7em; height: .7em; margin-right: .4em; flex: none }
 #mark { font-weight: 600; color: var(--good) }
 .bad, #mark.bad { color: var(--bad) }
+#fingerprint { color: var(--dim); overflow-wrap: anywhere }
+#code { font-size: 1.4em; letter-spacing: .1em }
 #trouble { margin: .5rem 0 0; padding-left: 1.2rem; color: var(--bad); overflow-wrap: anywhere }
 .wide { overflow-x: auto }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
@@ -76,6 +78,10 @@ tr.gone { color: var(--dim) }
 <h2>Robots</h2><div class="wide"><table id="robots"></table></div>
 <h2>Objects</h2><div class="wide"><table id="objects"></table></div>
 <h2>Clients</h2><div class="wide"><table id="clients"></table></div>
+<section id="headset" hidden><h2>Headset page</h2>
+<p><span id="address"></span>, code for the next wearer: <b id="code"></b><br>
+SHA-256: <span id="fingerprint"></span></p>
+<div class="wide"><table id="wearers"></table></div></section>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
 </main>
@@ -264,12 +270,29 @@ function show(now) {
   table("clients", ["client", "drives a robot", "refused messages", "the last"],
     entries(now.clients).map(([, one]) => ({cells: [
       one.name, one.drives_robot ? "yes" : "", one.refused_messages, one.last_refusal]})));
+  showHeadset(now.headset);
   const loops = now.loops ?? {};
   table("loops", ["tried", "accepted", "waiting for a supporting loop", "in the maps", "merges"],
     now.loops ? [{cells: [loops.tried, loops.accepted, loops.waiting, loops.in_map, now.merges?.done]}] : []);
   table("times", ["step", "p50", "p95", "max", "count"],
     entries(now).filter(([k, t]) => k.endsWith("_ms") && t && "p50" in t).map(([k, t]) => ({cells: [
       k.slice(0, -3), fixed(t.p50, 1), fixed(t.p95, 1), fixed(t.max, 1), t.n]})));
+}
+
+function showHeadset(headset) {
+  at("headset").hidden = !headset;
+  if (!headset) return;
+  at("address").textContent = headset.address;
+  at("code").textContent = headset.code;
+  at("fingerprint").textContent = headset.fingerprint;
+  const mm = (x, unit) => Number.isFinite(x) ? `${fixed(x, 1)} ${unit}` : "–";
+  table("wearers",
+    ["wearer", "device of", "page", "mode", "lag p50", "p95", "p99", "over 20 ms", "alignment", "drift"],
+    entries(headset.wearers).map(([name, wearer]) => ({kind: wearer.is_connected ? "" : "gone", cells: [
+      name, wearer.agent, wearer.is_connected ? "connected" : "away", wearer.mode,
+      age(wearer.p50_ms), age(wearer.p95_ms), age(wearer.p99_ms),
+      wearer.frames && `${wearer.over_20ms} of ${wearer.frames}`,
+      mm(wearer.alignment_mm, "mm"), mm(wearer.drift_mm_s, "mm/s")]})));
 }
 
 async function refresh() {

@@ -71,7 +71,7 @@ _FULL_DROP_MS = 1000.0  # delay at which `linear` allows only the minimum rate
 class AgentReport:
     """An evaluation as it arrives at the edge. now_ns: by the edge's clock. keyframes, poses: of this agent,
     that have arrived so far. held_ms: how long the edge holds acknowledgements, for its disk. is_placed: see
-    `share.scheduling.room_budget.AgentAir`. arrival_ms: from the message before its newest keyframe until
+    `share.scheduling.room_budget.AgentDemand`. arrival_ms: from the message before its newest keyframe until
     that had arrived, by the edge's clock."""
 
     kind: AgentKind

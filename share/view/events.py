@@ -48,13 +48,16 @@ class KeyframeArrived:
 @dataclass(frozen=True, eq=False)
 class PoseArrived:
     """A run's newest pose (4, 4), relative to its keyframe `keyframe`; -1: in odom. age_ms: as in
-    `PoseUpdate`; None: unknown."""
+    `PoseUpdate`; None: unknown. stamp_ns: by the agent's clock. received_ns: when it came to the
+    edge, by this machine's monotonic clock."""
 
     run: str
     state: TrackState
     keyframe: int
     T_keyframe_body: F64
     age_ms: float | None = None
+    stamp_ns: int = 0
+    received_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
-"""Bounded queue from the edge to the live room. It never blocks the edge; when full it drops its oldest.
+"""Bounded queue from the edge to a page's process. It never blocks the edge; when full it drops its oldest.
 
 The edge's loop only appends values that it has anyway, and wakes nobody; of poses, reports and refusals the
-newest is kept. A thread looks fifteen times a second, makes events of them and sends them to the viewer's
-process; if that is slow, this thread waits, and the queue drops.
+newest is kept. A thread looks some times a second, makes events of them and sends them to the process; if
+that is slow, this thread waits, and the queue drops.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from __future__ import annotations
 import contextlib
 import pickle
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -29,11 +31,11 @@ from share.wire.messages import Hello, PoseUpdate
 MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB
 _REPORTED = (
     *("run", "kind", "state", "reason", "gone", "trouble", "pose_ms", "qoe", "qoe_target", "rate_hz"),
-    *("delay_ms", "map_id", "keyframes", "loops"),
+    *("delay_ms", "map_id", "keyframes", "loops", "rtt_ms"),
 )
 END = b""
 _MOST_AT_ONCE = 32  # with keyframes of 30 kB, 1 MB
-_COLLECT_S = 1 / 15  # between messages: as often as the viewer draws
+COLLECT_S = 1 / 15  # between messages: as often as the viewer draws
 
 
 class _QueuedKeyframe(NamedTuple):
@@ -42,17 +44,28 @@ class _QueuedKeyframe(NamedTuple):
     rig: Rig
 
 
-class ViewFeed:
-    """Sends to `connection` until `close`; where the other end has gone, to none until `reconnect`. No method
-    waits or raises."""
+class _SeenPose(NamedTuple):
+    pose: PoseUpdate
+    received_ns: int  # monotonic
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection: Connection | None = connection
+
+class ViewFeed:
+    """Sends to `connection` until `close`; where there is none, or the other end has gone, to none until
+    `reconnect`. No method waits or raises.
+
+    collect_s: between messages. has_images: keyframes come with cam0's image.
+    """
+
+    def __init__(
+        self, connection: Connection | None = None, collect_s: float = COLLECT_S, has_images: bool = True
+    ) -> None:
+        self._connection = connection
+        self._collect_s, self._has_images = collect_s, has_images
         self._next_connection: Connection | None = None
         self._recap = Recap()
         self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
         # the newest of each run or agent, not queued
-        self._poses: Mapping[str, PoseUpdate] = {}
+        self._poses: Mapping[str, _SeenPose] = {}
         self._refusals: dict[str | None, ev.DecisionMade] = {}
         self._report: ev.AgentsReported | None = None
         self._sent_stamps: dict[str, int] = {}
@@ -99,7 +112,11 @@ class ViewFeed:
 
     def add_poses(self, poses: Mapping[str, PoseUpdate]) -> None:
         """Replace the newest poses, by run."""
-        self._poses = poses
+        now_ns, before = time.monotonic_ns(), self._poses
+        self._poses = {
+            run: old if (old := before.get(run)) is not None and old.pose is pose else _SeenPose(pose, now_ns)
+            for run, pose in poses.items()
+        }
 
     def add_report(self, report: Mapping[str, Any]) -> None:
         """Add edge.json as it is now."""
@@ -114,7 +131,7 @@ class ViewFeed:
         self._add(event)
 
     def reconnect(self, connection: Connection) -> None:
-        """Continue with another viewer, which first receives a recap."""
+        """Continue with another process, which first receives a recap."""
         self._next_connection = connection
 
     def close(self, wait_s: float = 1.0) -> None:
@@ -131,7 +148,7 @@ class ViewFeed:
     def _send_loop(self) -> None:
         is_closing = False
         while not (is_closing and not self._queue):
-            is_closing = self._closing.wait(_COLLECT_S)
+            is_closing = self._closing.wait(self._collect_s)
             if (connection := self._next_connection) is not None:
                 self._connection, self._next_connection = connection, None
                 self._sent_stamps.clear()
@@ -165,15 +182,24 @@ class ViewFeed:
         if (report := self._report) is not None:
             self._report = None
             yield report
-        for run, pose in self._poses.items():
+        for run, (pose, received_ns) in self._poses.items():
             if self._sent_stamps.get(run) != pose.stamp_ns:
                 self._sent_stamps[run] = pose.stamp_ns
-                yield ev.PoseArrived(run, pose.state, pose.keyframe, pose.T_keyframe_body, pose.age_ms)
+                yield ev.PoseArrived(
+                    run,
+                    pose.state,
+                    pose.keyframe,
+                    pose.T_keyframe_body,
+                    pose.age_ms,
+                    pose.stamp_ns,
+                    received_ns,
+                )
 
     def _events(self, entry: object) -> Iterator[ev.RoomEvent]:
         match entry:
             case _QueuedKeyframe():
-                yield sources.keyframe_event(*entry)
+                keyframe = sources.keyframe_event(*entry)
+                yield keyframe if self._has_images else replace(keyframe, jpeg=b"")
             case MapperResult():
                 for change in entry.changes:
                     if (shown := sources.change_event(change)) is not None:

@@ -1,8 +1,5 @@
 """The live room's process: takes events, and draws what has changed, at most fifteen times a second, while
-some browser looks.
-
-It has the lowest priority and ends with the process that started it, which it can neither hold up nor end.
-That one starts it again if it ends by itself, and ends it if its heartbeat stops.
+some browser looks. It has the lowest priority.
 """
 
 from __future__ import annotations
@@ -12,35 +9,24 @@ import os
 import pickle
 import signal
 import socket
-import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from typing import Any
 
 from share.errors import ShareError, UsageError
-from share.net import tcp
 from share.net.http_guard import HttpGuard, http_address, listen
 from share.net.transport import Address
-from share.spawning import SPAWN_CONTEXT
-from share.timing import Backoff, PeriodicTimer
+from share.timing import PeriodicTimer
 from share.view.events import SessionBegun
 from share.view.feed import END, ViewFeed
+from share.view.page_process import HEARTBEAT, LOOK_S, PageProcess, last_words, silence_output
 
 DRAW_HZ = 15.0
 _PANEL_S = 0.5  # between updates of the panel
 _NICENESS = 15
-_STOP_S = 2.0
 _MAX_MESSAGES = 64  # applied before something is drawn
-_MAX_REASON = 200  # characters
-_LOOK_S = 1.0  # between looks at the process, and between its heartbeats
-_HEARTBEAT = b""
-MAX_SILENT_LOOKS = 30  # in a row without a heartbeat: it hangs
-_MAX_START_LOOKS = 120  # before the first one: it has the lowest priority
-MAX_BYTES = 2**30  # of its memory
-_HEALTHY_NS = 60_000_000_000  # a live room that ran for so long waits 1 s again before its next start
 MISSING = "the live room needs viser: pip install 'viser>=1.1,<1.2'"
 
 
@@ -63,14 +49,11 @@ class LiveRoom:
     ) -> None:
         if not is_installed():
             raise UsageError(f"--view: {MISSING}")
-        self._listener, self._bound = listen(http_address("--view", address, token))
-        self.endpoint = str(self._bound).removeprefix("tcp://")
-        self._token, self._title, self._notify = token, title, notify
-        self._closing = threading.Event()
-        self._start()
-        self.feed = ViewFeed(self._connection)
-        self._watcher = threading.Thread(target=self._watch, name="view-watch", daemon=True)
-        self._watcher.start()
+        self._listener, bound = listen(http_address("--view", address, token))
+        self.endpoint = str(bound).removeprefix("tcp://")
+        self.feed = ViewFeed()
+        arguments = (self._listener, bound, token, title)
+        self._process = PageProcess("live room", _run, arguments, notify, self.feed.reconnect)
 
     @property
     def pid(self) -> int | None:
@@ -79,96 +62,14 @@ class LiveRoom:
     @property
     def is_alive(self) -> bool:
         """Whether there is a process that serves the page, or will in a moment."""
-        return self._is_alive
+        return self._process.is_alive
 
     def close(self) -> None:
         """End the process."""
-        self._closing.set()
+        self._process.announce_end()
         self.feed.close()
-        self._watcher.join(_STOP_S)
-        if self._watcher.is_alive():
-            self._process.kill()
-            self._watcher.join()
+        self._process.close()
         self._listener.close()
-
-    def _start(self) -> None:
-        """Raises OSError if the system is out of processes, memory or file descriptors."""
-        self._connection, child_end = SPAWN_CONTEXT.Pipe()
-        self._process = SPAWN_CONTEXT.Process(
-            target=_run,
-            args=(child_end, self._listener, self._bound, self._token, self._title),
-            name="view",
-            daemon=True,
-        )
-        self._process.start()
-        child_end.close()
-        self._is_alive = True
-
-    # ------------------------------------------------------------------ the watching thread
-
-    def _watch(self) -> None:
-        backoff = Backoff(time.monotonic_ns(), _HEALTHY_NS)
-        while True:
-            why = self._wait_for_end()
-            if self._closing.is_set():
-                return
-            delay_s = backoff.record_failure(time.monotonic_ns())
-            self._notify(f"the live room has ended ({why}) and starts again in {delay_s:.0f} s")
-            if self._closing.wait(delay_s):
-                return
-            try:
-                self._start()
-            except OSError as error:
-                self._notify(
-                    f"the live room cannot start again: {error.strerror}; the edge goes on without it"
-                )
-                return
-            self.feed.reconnect(self._connection)
-
-    def _wait_for_end(self) -> str:
-        """Wait for the process to end, or end it if it grows too large or hangs. Return why it ended."""
-        why, last_words, open_pipes = "", "", [self._connection]
-        silent_looks, max_silent = 0, _MAX_START_LOOKS
-        while self._process.sentinel not in (ready := wait([self._process.sentinel, *open_pipes], _LOOK_S)):
-            if not ready:  # counted, not timed: this process may have been stopped for a while itself
-                silent_looks += 1
-            else:
-                silent_looks, max_silent = 0, MAX_SILENT_LOOKS
-                if (text := self._hear()) is None:
-                    open_pipes = []
-                else:
-                    last_words = text
-            if not why and (why := _fault(self._process.pid, silent_looks, max_silent)):
-                self._is_alive = False
-                self._process.kill()
-        self._is_alive = False
-        self._process.join()
-        while (text := self._hear()) is not None:
-            last_words = text
-        self._connection.close()
-        return why or last_words or f"exit code {self._process.exitcode}"
-
-    def _hear(self) -> str | None:
-        """Return the next message of the process, "" if it is a heartbeat; None where it can send no more."""
-        try:
-            return self._connection.recv_bytes(4 * _MAX_REASON).decode(errors="replace")
-        except (EOFError, OSError):
-            return None
-
-
-def _fault(pid: int | None, silent_looks: int, max_silent: int) -> str:
-    """Return why a process has to be ended, "" if it need not be."""
-    if _memory_bytes(pid) > MAX_BYTES:
-        return f"it took more than {MAX_BYTES / 2**20:.0f} MB of memory"
-    return f"it did not answer for {silent_looks * _LOOK_S:.0f} s" if silent_looks >= max_silent else ""
-
-
-def _memory_bytes(pid: int | None) -> int:
-    """Return the memory that a process holds; 0 where the system does not say."""
-    try:
-        return 0 if pid is None else tcp.resident_bytes(pid)
-    except (OSError, IndexError, ValueError):
-        return 0
 
 
 def _run(
@@ -177,7 +78,7 @@ def _run(
     """Entry point of the process."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
     os.nice(_NICENESS)
-    _silence_output()
+    silence_output()
     from share.view.window import Window
 
     listener.setblocking(False)
@@ -189,20 +90,10 @@ def _run(
     except (EOFError, OSError):  # the parent has ended
         code = 0
     except Exception as error:
-        text = " ".join(f"{type(error).__name__}: {error}".split())
         with contextlib.suppress(OSError):
-            connection.send_bytes(text[:_MAX_REASON].encode())
+            connection.send_bytes(last_words(error))
     finally:
         os._exit(code)  # threads of viser would keep the process
-
-
-def _silence_output() -> None:
-    """Discard what libraries print: this process says nothing on its parent's terminal."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    sys.stdout.flush()
-    for stream in (1, 2):
-        os.dup2(null, stream)
-    os.close(null)
 
 
 class Viewer:
@@ -215,7 +106,7 @@ class Viewer:
         self._connection, self._window = connection, window
         self._room, self._panel = DrawnRoom(), SidePanel()
         self._panel_due_s = 0.0
-        self._heartbeat = PeriodicTimer(_LOOK_S)
+        self._heartbeat = PeriodicTimer(LOOK_S)
         self._is_ended = False
 
     def run(self) -> None:
@@ -229,7 +120,7 @@ class Viewer:
 
     def _show_that_it_runs(self) -> None:
         if self._heartbeat.fire_if_due(time.monotonic_ns()) and self._window.has_served():
-            self._connection.send_bytes(_HEARTBEAT)
+            self._connection.send_bytes(HEARTBEAT)
 
     def _take_events(self, now_s: float) -> None:
         for _ in range(_MAX_MESSAGES):

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.hellos import hello_of
+from helpers.reports import headset_report
 from helpers.room_bench import RoomBench, at
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -235,7 +236,8 @@ def test_metrics_that_the_report_lacks_are_omitted():
 
 
 def test_every_metric_has_a_value_in_a_real_report():
-    body, _ = edge_metrics.render_metrics({**real_report(), "uptime_s": 1.0, "trouble": [], "degraded": []})
+    more = {"uptime_s": 1.0, "trouble": [], "degraded": [], "headset": headset_report()}
+    body, _ = edge_metrics.render_metrics({**real_report(), **more})
     names = {name for name, _ in metrics(body)}
     absent = {row.name for row in edge_metrics.METRICS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
@@ -306,6 +308,7 @@ def test_the_page_shows_objects_robots_and_clients():
     bench.run(0.1)
     report = bench.edge.report({})
     fields = {"it": report["objects"]["7"], "robot": report["robots"]["bot"], "one": report["clients"][0]}
+    fields["wearer"] = headset_report()["wearers"]["ann"]
     with serving(lambda: report) as server:
         assert json.loads(get(server, "/snapshot.json")[2])["objects"] == report["objects"]
         page = get(server, "/")[2].decode()

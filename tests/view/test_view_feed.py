@@ -101,8 +101,24 @@ def test_a_pose_is_told_once() -> None:
             feed.add_poses({KEY: pose(stamp_ns)})
             time.sleep(0.2)  # longer than what is collected in one message
 
-    poses = told(tell)
-    assert [type(one) for one in poses] == [ev.PoseArrived] * 2
+    before_ns = time.monotonic_ns()
+    first, second = told(tell)
+    assert isinstance(first, ev.PoseArrived) and isinstance(second, ev.PoseArrived)
+    assert (first.stamp_ns, second.stamp_ns) == (1, 2)
+    assert before_ns < first.received_ns < second.received_ns < time.monotonic_ns()
+
+
+def test_a_page_that_shows_no_images_is_sent_none() -> None:
+    here, there = Pipe()
+    feed = ViewFeed(there, collect_s=0.01, has_images=False)
+    feed.add_effect(AddRun(KEY, hello_of("ann", 1)))
+    feed.add_effect(AddKeyframe(KEY, mc.keyframe(KEY, 0).keyframe))
+    threading.Thread(target=feed.close, daemon=True).start()
+    got: list[ev.RoomEvent] = []
+    while (data := here.recv_bytes()) != END:
+        got += pickle.loads(data)
+    (shown,) = (one for one in got if isinstance(one, ev.KeyframeArrived))
+    assert shown.jpeg == b"" and mc.keyframe(KEY, 0).keyframe.image.jpeg.size and len(shown.points)
 
 
 def test_keyframes_of_a_run_that_comes_back_are_told() -> None:

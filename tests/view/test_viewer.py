@@ -22,7 +22,7 @@ from share.errors import ShareError, TransportError, UsageError
 from share.mapping.loops import KeyframeKey
 from share.types import AgentKind, TrackState
 from share.view import events as ev
-from share.view import viewer
+from share.view import page_process, viewer
 from share.view.viewer import LiveRoom
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
@@ -181,7 +181,7 @@ def test_a_killed_viewer_is_reaped_told_and_started_again() -> None:
 def test_a_viewer_that_grows_too_large_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     with closing(LiveRoom("0", None, "test", told.append)):
-        monkeypatch.setattr(viewer, "MAX_BYTES", 2**20)
+        monkeypatch.setattr(page_process, "MAX_BYTES", 2**20)
         assert soon(lambda: bool(told))
         assert told[0] == "the live room has ended (it took more than 1 MB of memory) and starts again in 1 s"
 
@@ -197,7 +197,7 @@ def test_a_viewer_that_hangs_is_killed_told_and_started_again(monkeypatch: pytes
         for stamp_ns in range(20_000):
             room.feed.add_event(ev.PoseArrived("ann-1", TrackState.OK, 0, np.eye(4), float(stamp_ns)))
         assert room.pid == pid and not told  # all that, before anybody has noticed
-        monkeypatch.setattr(viewer, "MAX_SILENT_LOOKS", 3)
+        monkeypatch.setattr(page_process, "MAX_SILENT_LOOKS", 3)
         os.kill(pid, signal.SIGCONT)
         assert not soon(lambda: bool(told), within_s=5.0)  # a heartbeat comes
         os.kill(pid, signal.SIGSTOP)

@@ -21,7 +21,7 @@ class TimedMap:
     def __init__(self, config: Config) -> None:
         self.mapper, self.solver = Mapper(config), PoseGraphSolver()
         self.ms: dict[str, list[float]] = defaultdict(list)
-        self.findings: list[MapEvent] = []
+        self.map_events: list[MapEvent] = []
 
     def join(self, agent: str, hello: Hello) -> None:
         self.mapper.add_run(agent, hello)
@@ -30,7 +30,7 @@ class TimedMap:
         before = self.mapper.report()["removed_keyframes"]
         found, ms = _timed(self.mapper.add_keyframe, agent, keyframe)
         self.ms["add" if self.mapper.report()["removed_keyframes"] == before else "thin"].append(ms)
-        self.findings += found
+        self.map_events += found
 
     def look(self) -> None:
         """Run all pending look-ups."""
@@ -40,7 +40,7 @@ class TimedMap:
             found, ms = _timed(self.mapper.finish_step, step, result, ms)
             if step.kind == "verify":
                 self.ms["judge"].append(ms)
-            self.findings += found
+            self.map_events += found
 
     def solve(self) -> None:
         """Solve all maps that are due."""
@@ -52,7 +52,7 @@ class TimedMap:
             self.ms["solve"].append(ms)
             found, ms = _timed(self.mapper.finish_step, step, result, ms)
             self.ms["apply"].append(ms + tell_ms)
-            self.findings += found
+            self.map_events += found
 
 
 def _timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:

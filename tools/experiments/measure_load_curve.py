@@ -115,7 +115,7 @@ def grow(most: int, every: int) -> Iterator[Row]:
 def _costs(timed: TimedMap, count: int) -> Row:
     costs = {kind: round(float(np.median(ms)), 3) for kind, ms in timed.ms.items()}
     p95 = {f"{kind}_p95": round(float(np.percentile(ms, 95)), 3) for kind, ms in timed.ms.items()}
-    timed.findings.clear()
+    timed.map_events.clear()
     report = timed.mapper.report()
     return {"keyframes": count, "loops": report["loops"]["in_map"], "maps": _maps(report)} | costs | p95
 
@@ -158,7 +158,7 @@ def _state(timed: TimedMap, count: int, folder: Path) -> Row:
     spent = {f"{kind}_ms": round(sum(ms) / _SAMPLE, 3) for kind, ms in timed.ms.items()}  # per keyframe
     thin = timed.ms.get("thin", [0.0])
     timed.ms.clear()
-    timed.findings.clear()
+    timed.map_events.clear()
     return {
         "minutes": count / RATE_HZ / 3 / 60,
         "added": count,

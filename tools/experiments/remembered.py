@@ -50,10 +50,10 @@ class RememberingMapper(Mapper):
         return _Remembered(look.node_id, *views, look.query_image, look.candidate_image)
 
     def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
-        findings = super().finish_step(step, result, ms)
+        map_events = super().finish_step(step, result, ms)
         if isinstance(step, VerifyStep):
             self._note_standing()
-        return findings
+        return map_events
 
     def doubt(self, of: Collection[str]) -> float:
         """Return the largest contradiction ever between two of these."""

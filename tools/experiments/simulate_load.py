@@ -73,14 +73,14 @@ class ChargedSimulation(Simulation):
 
     def _run_mapper_round(self) -> None:
         self._is_busy = True
-        findings, spent_ns = list[MapEvent](), 0
+        map_events, spent_ns = list[MapEvent](), 0
         while self._inbox:
             _, action = self._inbox.popleft()
             found, took_ns = self._charge_mapper("add, apply", action)
-            findings += found
+            map_events += found
             spent_ns += took_ns
         self._start_solving(spent_ns)
-        self._schedule(spent_ns, lambda: self._send_findings(findings))
+        self._schedule(spent_ns, lambda: self._send_map_events(map_events))
         step, took_ns = self._charge_mapper("next", self.mapper.next_lookup)
         spent_ns += took_ns
         if step is None:
@@ -93,7 +93,7 @@ class ChargedSimulation(Simulation):
         found, took_ns = self._charge_mapper("judge", partial(self.mapper.finish_step, step, result, 0.0))
 
         def go_on() -> None:
-            self._send_findings(found)
+            self._send_map_events(found)
             self._run_mapper_round()
 
         self._schedule(took_ns, go_on)

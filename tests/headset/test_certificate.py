@@ -1,0 +1,88 @@
+"""The certificate of the headset page, made or given. Needs the package cryptography."""
+
+from __future__ import annotations
+
+import hashlib
+import ssl
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from share.errors import UsageError
+from share.headset.certificate import given_certificate, own_certificate, session_key
+
+needs_cryptography = pytest.mark.skipif(
+    subprocess.run([sys.executable, "-c", "import cryptography"], capture_output=True).returncode != 0,
+    reason="cryptography is not installed",
+)
+
+
+@needs_cryptography
+def test_it_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "share" / "headset"
+    made = own_certificate(folder, "192.168.1.5")
+    assert own_certificate(folder, "10.0.0.1") == made
+    assert {one.name: one.stat().st_mode & 0o777 for one in folder.iterdir()} == {
+        "headset.crt": 0o600,
+        "headset.key": 0o600,
+    }
+    der = ssl.PEM_cert_to_DER_cert(made.certificate.read_text())
+    assert made.fingerprint.replace(":", "").lower() == hashlib.sha256(der).hexdigest()
+    assert "localhost" in made.names and made.end > datetime.now(UTC) + timedelta(days=700)
+    made.context()
+
+
+@needs_cryptography
+def test_one_that_is_over_is_made_anew_and_a_given_one_refused(tmp_path: Path) -> None:
+    old = own_certificate(tmp_path, "::1", datetime.now(UTC) - timedelta(days=729, hours=2))
+    assert own_certificate(tmp_path, "::1").fingerprint != old.fingerprint
+    own_certificate(tmp_path / "b", "edge.example", datetime.now(UTC) - timedelta(days=800))
+    given = (tmp_path / "b" / "headset.crt", tmp_path / "b" / "headset.key")
+    with pytest.raises(
+        UsageError, match=r"--headset-cert .*: it was valid until 20\d\d-\d\d-\d\d; give a newer"
+    ):
+        given_certificate(*given)
+
+
+@needs_cryptography
+def test_a_given_one_that_is_none_is_one_line(tmp_path: Path) -> None:
+    own, other = (own_certificate(tmp_path / name, "::1") for name in "ab")
+    assert given_certificate(own.certificate, own.key) == own
+    (tmp_path / "text").write_text("x")
+    for certificate, key, said in (
+        (own.certificate, other.key, "--headset-key .*is not the key of this certificate"),
+        (own.certificate, tmp_path / "text", "--headset-key .*is no key"),
+        (own.certificate, tmp_path / "none", "--headset-key .*: cannot be read: No such file"),
+        (own.key, own.key, "--headset-cert .*is no certificate"),
+        (tmp_path / "text", own.key, "--headset-cert .*is no certificate"),
+        (tmp_path, own.key, "--headset-cert .*: cannot be read: it is a folder"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            given_certificate(certificate, key)
+
+
+@needs_cryptography
+def test_a_key_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    own_certificate(tmp_path, "::1").key.chmod(0o640)
+    with pytest.raises(UsageError, match=r"others can read it; `chmod 600"):
+        own_certificate(tmp_path, "::1")
+
+
+def test_without_the_package_it_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(UsageError, match=r"cryptography is not installed.*\[headset\].*--headset-cert"):
+        own_certificate(tmp_path, "::1")
+
+
+def test_the_key_of_sessions_stays(tmp_path: Path) -> None:
+    key = session_key(tmp_path / "a")
+    assert len(key) == 32 and session_key(tmp_path / "a") == key != session_key(tmp_path / "b")
+    (tmp_path / "a" / "headset.secret").write_bytes(b"short")
+    with pytest.raises(UsageError, match="expected 32 bytes; remove it"):
+        session_key(tmp_path / "a")
+    (tmp_path / "b" / "headset.secret").chmod(0o644)
+    with pytest.raises(UsageError, match="chmod 600"):
+        session_key(tmp_path / "b")

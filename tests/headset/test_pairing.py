@@ -1,0 +1,110 @@
+"""Who is let in to the headset page."""
+
+from __future__ import annotations
+
+import base64
+from itertools import count
+
+import pytest
+
+from share.headset.pairing import (
+    MAX_WRONG,
+    SESSION_S,
+    PairingDesk,
+    PairingError,
+    WearerSession,
+    seal,
+    unseal,
+)
+
+KEY = b"k" * 32
+SECOND = 10**9
+
+
+def desk(start: int = 123) -> PairingDesk:
+    numbers = count(start)
+    return PairingDesk(lambda below: next(numbers) % below)
+
+
+def test_the_code_lets_in_once_it_is_renewed_by_who_is_let_in() -> None:
+    one = desk()
+    assert one.code == "000123"
+    one.check("000123", "a", 0)
+    one.renew()
+    assert one.code == "000124"
+    with pytest.raises(PairingError, match="not the code"):
+        one.check("000123", "a", 0)
+
+
+@pytest.mark.parametrize("given", ["", "123", "0001230", "０００１２３", "000123 ", "é" * 200])
+def test_what_is_not_the_code_is_refused(given: str) -> None:
+    with pytest.raises(PairingError, match="not the code"):
+        desk().check(given, "a", 0)
+
+
+def test_ten_wrong_codes_renew_it() -> None:
+    one = desk()
+    for k in range(MAX_WRONG):
+        assert one.code == "000123"
+        with pytest.raises(PairingError, match="not the code"):
+            one.check("999999", f"address {k}", k * 60 * SECOND)
+    assert one.code == "000124" and one.wrong_count == MAX_WRONG
+
+
+def test_an_address_has_three_tries_then_one_in_ten_seconds() -> None:
+    one = desk()
+    answers = []
+    for k in range(40):
+        with pytest.raises(PairingError) as refused:
+            one.check("999999", "a", k * SECOND)
+        answers.append("not the code" in str(refused.value))
+    assert sum(answers[:4]) == 3 and sum(answers) == 3 + 3
+    one.check(one.code, "b", 40 * SECOND)  # another address is not held up
+
+
+def test_all_addresses_together_have_few_tries() -> None:
+    """A guess hits one of a million: in an hour less than once in a thousand."""
+    one, tried = desk(), 0
+    for k in range(3600 * 4):
+        with pytest.raises(PairingError) as refused:
+            one.check("x", f"address {k}", k * SECOND // 4)
+        tried += "not the code" in str(refused.value)
+    assert 700 < tried < 800
+
+
+def test_many_addresses_take_no_memory() -> None:
+    one = desk()
+    for k in range(5000):
+        with pytest.raises(PairingError):
+            one.check("x", f"address {k}", 0)
+    assert len(one._of_address) <= 1024
+    one.check(one.code, "another address", 100 * SECOND)
+
+
+def test_a_session_is_known_again_by_its_secret_alone() -> None:
+    session = WearerSession("Ann Ö", "ann", 1000.0, "n")
+    assert unseal(KEY, seal(KEY, session), 999.0) == session
+    with pytest.raises(PairingError, match="is over"):
+        unseal(KEY, seal(KEY, session), 1000.0)
+    late = WearerSession("ann", None, 3 * SESSION_S, "n")  # made when the clock was ahead
+    with pytest.raises(PairingError, match="is over"):
+        unseal(KEY, seal(KEY, late), 0.0)
+
+
+def test_no_changed_secret_is_a_session() -> None:
+    secret = seal(KEY, WearerSession("ann", "ann", 1000.0, "n"))
+    data = base64.urlsafe_b64decode(secret)
+    changed = [bytes([*data[:k], data[k] ^ 1, *data[k + 1 :]]) for k in range(len(data))]
+    texts = [base64.urlsafe_b64encode(one).decode() for one in changed]
+    for text in (
+        *texts,
+        "",
+        "=",
+        "é",
+        "\ud800",
+        "A" * 5000,
+        secret[:-4],
+        seal(b"j" * 32, WearerSession("a", None, 9, "")),
+    ):
+        with pytest.raises(PairingError, match="not known here"):
+            unseal(KEY, text, 0.0)
