@@ -326,7 +326,7 @@ def test_flat_pages_share_what_a_mouse_places(chromium: Browser, room: HeadsetRo
     assert np.hypot(*(np.subtract(final, placed)[1:])) > 0.2
     ben.wait(f"Math.abs((app.room.objects.get({final[0]})?.T[12] ?? 1e9) - {final[1]}) < 1e-6")
     assert ben.app(f"app.room.objects.get({final[0]}).owner") == "ann"
-    assert ann.wait("app.room.objects.get(%d).isHeld === false" % final[0])
+    ann.wait(f"app.room.objects.get({final[0]}).isHeld === false")
     ann.click("[data-name=there]")
     ann.wait("app.room.words('bot').includes('to go')")
     (goto,) = room.of_type("goto")

@@ -83,7 +83,7 @@ class BrowserPage:
         """Return the value of an expression of `app`, the page's state."""
         return self.evaluate(f'import("/main.js").then(({{ app }}) => {{ return ({expression}); }})')
 
-    def wait(self, expression: str, seconds: float = 10.0) -> Any:
+    def wait(self, expression: str, seconds: float = 30.0) -> Any:
         """Return the value of an expression of `app` once it is true."""
         end = time.monotonic() + seconds
         while not (value := self.app(expression)):
@@ -110,8 +110,8 @@ class BrowserPage:
 
     def click(self, selector: str) -> None:
         box = self.evaluate(
-            f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])"
-            f"(document.querySelector({selector!r}).getBoundingClientRect())"
+            f"((one) => {{ one.scrollIntoView({{ block: 'center' }}); const box = one.getBoundingClientRect();"
+            f"return [box.x + box.width / 2, box.y + box.height / 2]; }})(document.querySelector({selector!r}))"
         )
         self.mouse("mousePressed", *box)
         self.mouse("mouseReleased", *box)

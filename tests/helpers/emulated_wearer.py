@@ -85,9 +85,9 @@ def pair(page: BrowserPage, name: str, agent: str = "", code: str = CODE) -> Non
     page.click("#pairing button")
 
 
-def wear(browser: Browser, room: HeadsetRoom, name: str) -> BrowserPage:
+def wear(browser: Browser, room: HeadsetRoom, name: str, size: tuple[int, int] = (480, 240)) -> BrowserPage:
     """Open the page in an emulated headset, pair as wearer and agent `name`, and enter."""
-    page = browser.page(room.url, 1200, 600, emulator())
+    page = browser.page(room.url, *size, emulator())
     page.evaluate(f"(() => {{{_SCRIPT}}})()")
     pair(page, name, name)
     page.wait("app.connection.isConnected && app.connection.clock.isKnown")

@@ -74,7 +74,7 @@ export class Hud {
         const { app } = this;
         const isPaired = app.connection.isPaired;
         at("start").hidden = isPaired;
-        at("bar").hidden = !isPaired;
+        at("bar").hidden = !isPaired || app.isInHeadset;
         at("reason").textContent = isPaired ? "" : app.connection.text === "not paired" ? "" : app.connection.text;
         const lines = isPaired ? stateLines(app) : [];
         while (this.#texts.length < lines.length) {
@@ -82,6 +82,9 @@ export class Hud {
             at("state").append(element);
             this.#texts.push(element);
         }
+        const { width, height, left } = at("bar").getBoundingClientRect();
+        const isBelow = left === 0;  // on phones
+        app.preview.covered = { left: isBelow ? 0 : width, bottom: isBelow ? height : 0 };
         this.#texts.forEach((element, k) => {
             const [text, colour] = lines[k] ?? ["", PLAIN];
             if (element.textContent !== text) element.textContent = text;

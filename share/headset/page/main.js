@@ -37,7 +37,7 @@ class App {
     #viewProjection = identity();
     #T_view_map = identity();
     #eye = new Float64Array(3);
-    #frame = { mapId: null, floorZ: 0, eye: null, pointers: [], hovered: null, panel: null, isFlat: true, hidesOwn: false };
+    #frame = { mapId: null, floorZ: 0, eye: null, T_map_camera: null, pointers: [], hovered: null, panel: null };
 
     constructor(canvas) {
         this.canvas = canvas;
@@ -175,6 +175,7 @@ class App {
         frame.mapId = this.place.mapId;
         frame.floorZ = this.place.floorZ;
         frame.eye = eye;
+        frame.T_map_camera = this.isInHeadset ? null : this.preview.T_map_camera;
         frame.pointers = pointers;
         frame.hovered = this.interaction.hovered;
         frame.panel = this.isInHeadset ? this.panel : null;

@@ -2,11 +2,11 @@
 // looked at, and comes along when the wearer turns or walks away.
 import { identity, inverse, multiply, transformPoint } from "./math.js";
 
-const [WIDTH_M, HEIGHT_M] = [0.62, 0.465];
+const [WIDTH_M, HEIGHT_M] = [0.48, 0.36];
 const [WIDTH, HEIGHT] = [1024, 768];
 const COLUMNS = 4;
 const [BUTTON_TOP, BUTTON_HEIGHT, GAP, MARGIN] = [416, 96, 14, 32];
-const [AHEAD_M, BELOW_M] = [0.85, 0.32];
+const [AHEAD_M, BELOW_M] = [0.8, 0.36];
 const MAX_TURNED = 0.75;  // rad, and
 const MAX_AWAY_M = 0.5;  // beyond which it comes along
 const REDRAWN_MS = 250;

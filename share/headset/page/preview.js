@@ -10,6 +10,8 @@ export class Preview {
     eye = new Float64Array(3);
     projection = new Float64Array(16);
     T_camera_map = identity();
+    T_map_camera = identity();
+    covered = { left: 0, bottom: 0 };  // of the picture, px: the room is drawn beside it
     pointers = [];  // those of fingers that are down, and the mouse
     #target = [0, 0, -0.6];
     #wanted = null;  // {target, distance}, until the camera is moved by hand
@@ -18,7 +20,6 @@ export class Preview {
     #distance = 7;
     #isMoved = false;
     #fingers = new Map();  // by pointerId: {x, y, pointer, isTurning}
-    #T_map_camera = identity();
 
     // interaction: told of presses, moves, releases.
     constructor(canvas, interaction) {
@@ -34,10 +35,12 @@ export class Preview {
     // Show what there is, until the camera is moved by hand. positions: [[x, y, z] ..]
     showAll(positions) {
         if (this.#isMoved || positions.length === 0) return;
+        const isFirst = this.#wanted === null;
         const [low, high] = [Math.min, Math.max].map((of) => [0, 1, 2].map((i) => of(...positions.map((p) => p[i]))));
         const target = [0, 1, 2].map((i) => (low[i] + high[i]) / 2);
         const extent = Math.hypot(...[0, 1, 2].map((i) => high[i] - low[i]));
-        this.#wanted = { target, distance: Math.max(4, 1.35 * extent + 1.5) };
+        this.#wanted = { target, distance: Math.max(3.5, 1.25 * extent + 1.5) };
+        if (isFirst) [this.#target, this.#distance] = [[...target], this.#wanted.distance];
     }
 
     // Bring the camera up to date for a frame of so many pixels.
@@ -50,11 +53,13 @@ export class Preview {
         const aspect = width / height;
         const fovY = aspect >= 1 ? LEAST_VIEW : Math.min(2 * Math.atan(Math.tan(LEAST_VIEW / 2) / aspect), MOST_VIEW);
         perspective(this.projection, fovY, aspect, 0.05, 200);
+        this.projection[8] = -this.covered.left / this.canvas.clientWidth;
+        this.projection[9] = -this.covered.bottom / this.canvas.clientHeight;
         const [c, s] = [Math.cos(this.#pitch), Math.sin(this.#pitch)];
         const [x, y] = [Math.cos(this.#yaw), Math.sin(this.#yaw)];
         const back = [c * x, c * y, s];  // from what is looked at to the eye
         for (let i = 0; i < 3; i++) this.eye[i] = this.#target[i] + this.#distance * back[i];
-        const T = this.#T_map_camera;
+        const T = this.T_map_camera;
         T.set([-y, x, 0, 0, -s * x, -s * y, c, 0, ...back, 0, ...this.eye, 1]);
         inverse(this.T_camera_map, T);
         for (const { x: left, y: top, pointer } of this.#fingers.values()) this.#point(pointer, left, top);
@@ -65,8 +70,8 @@ export class Preview {
         const { clientWidth, clientHeight } = this.canvas;
         const x = (2 * left) / clientWidth - 1;
         const y = 1 - (2 * top) / clientHeight;
-        const T = this.#T_map_camera;
-        const [a, b] = [x / this.projection[0], y / this.projection[5]];
+        const T = this.T_map_camera;
+        const [a, b] = [(x + this.projection[8]) / this.projection[0], (y + this.projection[9]) / this.projection[5]];
         const d = [0, 1, 2].map((i) => a * T[i] + b * T[i + 4] - T[i + 8]);
         const length = Math.hypot(...d);
         for (let i = 0; i < 3; i++) {
@@ -143,7 +148,7 @@ export class Preview {
 
     #shift(dx, dy) {
         const perPixel = this.#distance / this.canvas.clientHeight;
-        const T = this.#T_map_camera;
+        const T = this.T_map_camera;
         const length = Math.hypot(T[8], T[9]) || 1;
         for (let i = 0; i < 2; i++) this.#target[i] += perPixel * (-dx * T[i] - (dy * T[8 + i]) / length);
     }

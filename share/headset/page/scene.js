@@ -7,8 +7,9 @@ import { STANDING } from "./room.js";
 const STILL = [0, 0, 0];
 const WHITE = [1, 1, 1];
 const POINTS = [0.62, 0.74, 0.85];
-const LABEL_SHARE = 0.034;  // of the distance; within
-const [LEAST_LABEL_M, MOST_LABEL_M] = [0.045, 0.3];
+const LABEL_SHARE = 0.027;  // of the distance; within
+const [LEAST_LABEL_M, MOST_LABEL_M] = [0.04, 0.3];
+const OWNER = 0.75;  // of an object, in that size
 
 export class Scene {
     #items = [];  // agents as drawn, made once each: {T, model, foot}
@@ -50,7 +51,8 @@ export class Scene {
         }
     }
 
-    // frame: {mapId, floorZ, eye, pointers, hovered, panel, isFlat, hidesOwn}; eye in the map.
+    // frame: {mapId, floorZ, eye, T_map_camera, pointers, hovered, panel, isFlat, hidesOwn}; eye in the map; texts are
+    // level with a camera, or turned to the eye where it is null.
     draw(frame) {
         const { renderer, room } = this;
         if (frame.mapId !== null) {
@@ -111,7 +113,7 @@ export class Scene {
         this.renderer.drawLines("ray", this.#model, WHITE, isPressed ? 0.9 : 0.5, isPressed ? 4 : 2.5);
         if (reach === null) return;
         const p = [0, 1, 2].map((i) => T_map_pointer[12 + i] - T_map_pointer[8 + i] * reach);
-        this.#faceEye(p, 0.012 + 0.004 * reach, 0.012 + 0.004 * reach, eye);
+        this.#faceEye(p, 0.006 + 0.003 * reach, 0.006 + 0.003 * reach, eye);
         this.renderer.drawSolid("dot", this.#label, WHITE, 0.95);
     }
 
@@ -122,22 +124,34 @@ export class Scene {
             if (frame.hidesOwn && agent.name === room.ownAgent) continue;
             const height = agent.kind === "robot" ? 0.35 : 0.22;
             const words = room.words(agent.name);
-            if (words) this.#drawLabel(words, T[12], T[13], T[14] + height, frame.eye, 0);
-            this.#drawLabel(agent.label, T[12], T[13], T[14] + height, frame.eye, words ? 1 : 0);
+            if (words) this.#drawLabel(words, T[12], T[13], T[14] + height, frame, OWNER, 0);
+            this.#drawLabel(agent.label, T[12], T[13], T[14] + height, frame, 1, words ? 1 : 0);
         }
         for (const { mapId, kind, owner, shown } of room.objects.values()) {
             if (mapId !== frame.mapId) continue;
-            this.#drawLabel(owner, shown[12], shown[13], shown[14] + (kind === "marker" ? 0.6 : 0.2), frame.eye, 0);
+            this.#drawLabel(owner, shown[12], shown[13], shown[14] + (kind === "marker" ? 0.55 : 0.15), frame, OWNER, 0);
         }
     }
 
     // row: 0, or above that.
-    #drawLabel(text, x, y, z, eye, row) {
+    #drawLabel(text, x, y, z, { eye, T_map_camera }, size, row) {
         const { texture, aspect } = this.labels.of(text);
         const distance = Math.hypot(x - eye[0], y - eye[1], z - eye[2]);
-        const height = Math.min(Math.max(LABEL_SHARE * distance, LEAST_LABEL_M), MOST_LABEL_M);
-        this.#faceEye([x, y, z + (row + 0.5) * 1.15 * height], height * aspect, height, eye);
+        const height = size * Math.min(Math.max(LABEL_SHARE * distance, LEAST_LABEL_M), MOST_LABEL_M);
+        const at = [x, y, z + (row + 0.5) * 1.15 * height];
+        if (T_map_camera === null) this.#faceEye(at, height * aspect, height, eye);
+        else this.#levelWith(T_map_camera, at, height * aspect, height);
         this.renderer.drawPicture(texture, this.#label, 1, true);
+    }
+
+    #levelWith(T, at, width, height) {
+        const M = this.#label;
+        M.set(T);
+        for (let i = 0; i < 3; i++) {
+            M[i] *= width;
+            M[4 + i] *= height;
+            M[12 + i] = at[i];
+        }
     }
 
     // Upright, turned to the eye.
