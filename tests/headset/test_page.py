@@ -309,12 +309,12 @@ def test_pairing_says_what_is_wrong_and_a_name_is_a_text(chromium: Browser, room
 
 
 def test_flat_pages_share_what_a_mouse_places(chromium: Browser, room: HeadsetRoom) -> None:
-    ann, ben = (chromium.page(room.url, *size) for size in ((1440, 900), (390, 844)))
+    ann, ben = (chromium.page(room.url, *size) for size in ((960, 540), (390, 844)))
     for page, name in ((ann, "ann"), (ben, "ben")):
         worn.pair(page, name)
         page.wait("app.place.mapId !== null && app.room.agents.size === 3")
     ann.click("[data-name=marker]")
-    drag = [(700 + 12 * k, 420 + 3 * k) for k in range(8)]
+    drag = [(640 + 12 * k, 330 + 3 * k) for k in range(8)]
     ann.mouse("mouseMoved", *drag[0])
     ann.mouse("mousePressed", *drag[0])
     placed = ann.wait("[...app.room.objects.values()].map((one) => [one.id, one.T[12], one.T[13]])[0]")
@@ -349,7 +349,7 @@ def test_what_is_refused_goes_back_and_is_said(chromium: Browser, room: HeadsetR
     room.refusal = "ann has 16 objects already"
     page.click("[data-name=cube]")
     for kind in ("mousePressed", "mouseReleased"):
-        page.mouse(kind, 720, 450)
+        page.mouse(kind, 700, 350)
     page.wait("document.getElementById('state').textContent.includes('16 objects already')")
     assert page.app("app.room.objects.size") == 0 and len(room.objects) == 0
 

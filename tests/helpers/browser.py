@@ -24,7 +24,7 @@ import pytest
 from websockets.sync.client import connect
 
 IWER = "iwer@2.5.0"
-_CALL_S = 60.0
+_CALL_S = 120.0  # on a busy machine
 
 # A Quest 3 whose head, hands and recentering a test moves: `headset` is its device.
 _EMULATED = """
@@ -52,7 +52,7 @@ class BrowserPage:
     """A tab. `problems`: what its scripts said of errors, and what its content policy refused."""
 
     def __init__(self, endpoint: str) -> None:
-        self._connection, self._number = connect(endpoint, max_size=None), 0
+        self._connection, self._number = connect(endpoint, max_size=None, ping_interval=None, open_timeout=_CALL_S), 0
         self.problems = list[str]()
         for domain in ("Runtime", "Page", "Log"):
             self.call(f"{domain}.enable")
@@ -83,7 +83,7 @@ class BrowserPage:
         """Return the value of an expression of `app`, the page's state."""
         return self.evaluate(f'import("/main.js").then(({{ app }}) => {{ return ({expression}); }})')
 
-    def wait(self, expression: str, seconds: float = 30.0) -> Any:
+    def wait(self, expression: str, seconds: float = 60.0) -> Any:
         """Return the value of an expression of `app` once it is true."""
         end = time.monotonic() + seconds
         while not (value := self.app(expression)):
@@ -98,15 +98,9 @@ class BrowserPage:
             assert time.monotonic() < end
             time.sleep(0.03)
 
-    def resize(self, width: int, height: int) -> None:
-        is_phone = width < 600
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=2 if is_phone else 1,
-            mobile=is_phone,
-        )
+    def resize(self, width: int, height: int, scale: float = 1.0) -> None:
+        size = {"width": width, "height": height, "deviceScaleFactor": scale}
+        self.call("Emulation.setDeviceMetricsOverride", **size, mobile=width < height)
 
     def click(self, selector: str) -> None:
         box = self.evaluate(
@@ -145,12 +139,12 @@ class Browser:
         self._port, self._cleanup = port, cleanup
 
     def page(
-        self, url: str, width: int = 1440, height: int = 900, emulator: Path | None = None
+        self, url: str, width: int = 960, height: int = 540, emulator: Path | None = None
     ) -> BrowserPage:
         """Open a URL in a window of its own. emulator: that makes it a headset's browser."""
         listing = f"http://127.0.0.1:{self._port}/json/version"
         with urllib.request.urlopen(listing) as answer:
-            whole = connect(json.load(answer)["webSocketDebuggerUrl"], max_size=None)
+            whole = connect(json.load(answer)["webSocketDebuggerUrl"], max_size=None, open_timeout=_CALL_S)
         with whole:
             order = {"url": "about:blank", "newWindow": True, "width": width, "height": height}
             whole.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": order}))

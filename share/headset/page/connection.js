@@ -25,10 +25,12 @@ export class Connection {
     #number = Date.now();  // of requests and commands: rises, also after the page was loaded again
     #pings = 0;
     #heardMs = 0;
+    #others = new BroadcastChannel("share-pages");  // of this browser; a tab that is doubled has the same session
 
     constructor(url, onMessage) {
         this.#url = url;
         this.#onMessage = onMessage;
+        this.#others.onmessage = ({ data }) => data === this.#hello?.session && this.#onTakenOver();
         const session = sessionStorage.getItem(SECRET);
         if (session === null) return;
         this.#hello = { session };
@@ -165,17 +167,24 @@ export class Connection {
         this.isPaired = this.isConnected = true;
         this.#waitMs = FIRST_WAIT_MS;
         this.text = "connected";
+        this.#others.postMessage(welcome.session);
         this.clock.forget();
         for (let k = 0; k < FIRST_PINGS; k++) this.#timers.push(setTimeout(() => this.#ping(), 60 * k));
         for (const message of this.#pending.values()) this.#send(message);
     }
 
-    // The secret holds no longer, or another page has it now: nothing more is tried.
+    // Nothing more is tried: the secret holds no longer, or another page has it.
     #onRefused({ reason }) {
         this.#leave();
         sessionStorage.removeItem(SECRET);
         this.#hello = null;
         this.isPaired = false;
         this.text = reason;
+    }
+
+    #onTakenOver() {
+        const message = { type: "refused", reason: "another page of this browser goes on with the session" };
+        this.#onRefused(message);
+        this.#onMessage(message);
     }
 }

@@ -30,7 +30,7 @@ function agentLine({ room, place }) {
     const others = [...room.agents.values()].filter((one) => one.mapId === place.mapId && one !== own).length;
     const company = others === 1 ? "one other here" : `${others} others here`;
     if (room.ownAgent === null) return `looking on, ${others} in the map`;
-    if (!own) return `${room.ownAgent} has no pose yet: is its agent running?`;
+    if (!own) return `${room.ownAgent} is not there: is its agent running?`;
     return `${own.name} ${own.state}, ${company}`;
 }
 
@@ -67,6 +67,8 @@ export class Hud {
     // canEnter: whether the browser has immersive-ar.
     setCanEnter(canEnter) {
         at("enter").hidden = !canEnter;
+        at("flat").hidden = canEnter;
+        if (!isSecureContext) at("flat").textContent = "A flat view: AR needs HTTPS, or a page of this machine.";
     }
 
     // A few times a second.

@@ -1,7 +1,7 @@
 // What a ray does in the room: it presses buttons, places cubes and markers, drags them, removes them. A pointer is a
 // controller, a pinching hand, a finger or a mouse:
 //   {origin, direction (in the map), T_map_pointer (null: on a flat screen), isPressed}
-import { identity, inverse, multiply } from "./math.js";
+import { identity, inverse, multiply, rotate } from "./math.js";
 import { CUBE_EDGE } from "./geometry.js";
 import { poseOf } from "./room.js";
 
@@ -97,8 +97,14 @@ export class Interaction {
         this.#put(grab, nowMs);
     }
 
-    isGrabbing(pointer) {
-        return this.#grabs.has(pointer);
+    // The present map was joined to another.
+    joined(T_new_old) {
+        for (const grab of this.#grabs.values()) {
+            multiply(grab.T, T_new_old, grab.T);
+            if (grab.shift === undefined) continue;
+            grab.planeZ = grab.T[14];
+            rotate(grab.shift, T_new_old, grab.shift);
+        }
     }
 
     #make(kind, pointer, nowMs) {
@@ -124,9 +130,10 @@ export class Interaction {
     #grab(object, pointer) {
         const grab = { id: object.id, kind: object.kind, T: Float64Array.from(object.T), putMs: -Infinity };
         if (object.kind === "marker" || pointer.T_map_pointer === null) {
-            const distance = this.#reach(pointer, object.T[14]) ?? Math.hypot(...[0, 1, 2].map((i) => object.T[12 + i] - pointer.origin[i]));
+            const away = [0, 1, 2].map((i) => object.T[12 + i] - pointer.origin[i]);
+            const distance = this.#reach(pointer, object.T[14]) ?? Math.hypot(...away);
             grab.planeZ = object.T[14];
-            grab.shift = [0, 1].map((i) => object.T[12 + i] - (pointer.origin[i] + pointer.direction[i] * distance));
+            grab.shift = [0, 1, 2].map((i) => object.T[12 + i] - (pointer.origin[i] + pointer.direction[i] * distance));
         } else {
             grab.T_pointer_object = multiply(identity(), inverse(identity(), pointer.T_map_pointer), object.T);
         }

@@ -18,7 +18,6 @@ const HUD_MS = 200;
 const STOP_BUTTON = 5;  // B and Y of xr-standard gamepads
 const USUAL_SIGMA_M = 0.01;  // of a pose that names none
 const USUAL_SIGMA_RAD = 0.004;
-const POSED = new Set(["OK", "WEAK", "VISION_ONLY", "INERTIAL_ONLY"]);
 
 class App {
     wearer = "";
@@ -56,7 +55,8 @@ class App {
         setInterval(() => this.hud.update(), HUD_MS);
         this.hud.update();
         requestAnimationFrame((timeMs) => this.#drawFlat(timeMs));
-        navigator.xr?.isSessionSupported("immersive-ar").then((canEnter) => this.hud.setCanEnter(canEnter));
+        const asked = navigator.xr?.isSessionSupported("immersive-ar") ?? Promise.resolve(false);
+        asked.then((canEnter) => this.hud.setCanEnter(canEnter));
     }
 
     get isInHeadset() {
@@ -103,7 +103,7 @@ class App {
                 for (const pose of message.poses) if (pose.agent === this.room.ownAgent) this.#onOwnPose(pose);
                 break;
             case "map_changed":
-                this.placement.joined(message.old, message.new, fromRows(message.T_new_old));
+                this.#onJoined(message.old, message.new, fromRows(message.T_new_old));
                 break;
             case "receipt":
                 if (message.reason) this.commands.tell(message.reason);
@@ -114,9 +114,14 @@ class App {
         for (const { reason } of this.room.removals.splice(0)) this.commands.tell(reason);
     }
 
+    #onJoined(oldId, newId, T_new_old) {
+        if (this.place.mapId === oldId) this.interaction.joined(T_new_old);
+        this.placement.joined(oldId, newId, T_new_old);
+    }
+
     #onOwnPose(pose) {
         const timeMs = this.connection.clock.toPage(pose.t_ms);
-        if (timeMs === null || pose.map_id === null || !POSED.has(pose.state)) return;
+        if (timeMs === null || pose.map_id === null) return;
         const cov = new Float64Array(36);
         const variances = [pose.sigma_rad ?? USUAL_SIGMA_RAD, pose.sigma_m ?? USUAL_SIGMA_M].map((sigma) => sigma ** 2 / 3);
         for (let i = 0; i < 6; i++) cov[7 * i] = variances[i < 3 ? 0 : 1];  // sigmas are of three axes together
@@ -161,7 +166,7 @@ class App {
         gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
         renderer.beginView(0, 0, width, height, multiply(this.#viewProjection, preview.projection, preview.T_camera_map));
         this.scene.draw(this.#frame);
-        this.#noteFrame(beganMs, timeMs, room.agents.get(room.ownAgent)?.stampMs);
+        this.#noteFrame(beganMs, timeMs, room.agents.get(room.ownAgent));
     }
 
     #positions() {
@@ -183,12 +188,12 @@ class App {
         frame.hidesOwn = this.isInHeadset;
     }
 
-    // stampMs: of the newest pose of the own device that the frame knew, on the server's clock.
-    #noteFrame(beganMs, displayMs, stampMs) {
+    // own: the own device, with the newest pose that the frame knew.
+    #noteFrame(beganMs, displayMs, own) {
         this.frames++;
         const nowMs = performance.now();
         this.script.add(nowMs - beganMs);
-        const poseMs = stampMs === undefined ? null : this.connection.clock.toPage(stampMs);
+        const poseMs = own?.isPosed ? this.connection.clock.toPage(own.stampMs) : null;
         if (poseMs !== null) this.latency.add(Math.max(nowMs, displayMs) - poseMs);
     }
 
@@ -261,7 +266,7 @@ class App {
         }
         this.alignmentMm = placement.sigmaMm(this.#T_local_viewer);
         this.driftMmS = placement.driftMmS(this.#T_local_viewer, displayMs);
-        this.#noteFrame(beganMs, displayMs, this.room.agents.get(this.room.ownAgent)?.stampMs);
+        this.#noteFrame(beganMs, displayMs, this.room.agents.get(this.room.ownAgent));
     }
 
     // Without a place in the map the panel is drawn all the same.
@@ -270,7 +275,8 @@ class App {
         place.mapId = placement.mapId;
         if (place.mapId === null) inverse(place.T_map_local, T_xr_map);
         else place.T_map_local.set(placement.T_map_local);
-        place.floorZ = place.T_map_local[14];  // the origin of local-floor is on the floor
+        const below = transformPoint(this.#eye, place.T_map_local, [this.#T_local_viewer[12], 0, this.#T_local_viewer[14]]);
+        place.floorZ = below[2];  // of local-floor, under the wearer
     }
 
     #updatePointers(frame, nowMs) {

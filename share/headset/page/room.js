@@ -115,20 +115,24 @@ export class Room {
     }
 
     #onPose(pose) {
-        if (pose.map_id === null) {
+        if (pose.state === "GONE") {
             this.agents.delete(pose.agent);
             return;
         }
         let one = this.agents.get(pose.agent);
         if (one === undefined) {
-            one = { name: pose.agent, colour: this.colour(pose.agent), T: identity(), path: null, pathRevision: 0 };
+            const place = { mapId: null, T: identity(), path: null, pathRevision: 0 };
+            one = { name: pose.agent, colour: this.colour(pose.agent), ...place };
             this.agents.set(pose.agent, one);
         }
-        fromPose(one.T, pose.position, pose.quaternion);
         if (one.state !== pose.state) one.label = pose.state === "OK" ? pose.agent : `${pose.agent} · ${pose.state}`;
         one.kind = pose.kind;
         one.state = pose.state;
+        one.velocity = one.angularVelocity = null;
+        one.isPosed = pose.map_id !== null;
+        if (!one.isPosed) return;  // it stays where it was last
         one.mapId = pose.map_id;
+        fromPose(one.T, pose.position, pose.quaternion);
         one.stampMs = pose.t_ms;
         one.velocity = pose.velocity;
         one.angularVelocity = pose.angular_velocity;
@@ -171,12 +175,10 @@ export class Room {
         }
     }
 
-    #onPoints({ map_id: mapId, count, data }) {
+    #onPoints({ map_id: mapId, part, count, data }) {
         const points = this.points;
-        if (points.mapId !== mapId) {
-            points.mapId = mapId;
-            points.count = 0;
-        }
+        if (part === 0) points.count = 0;
+        points.mapId = mapId;
         const bytes = Uint8Array.from(atob(data), (character) => character.charCodeAt(0));
         const some = Math.min(count, MAX_POINTS - points.count);
         points.xyz.set(new Float32Array(bytes.buffer, 0, 3 * some), 3 * points.count);

@@ -78,7 +78,7 @@ export class Scene {
 
     #drawAgent({ agent, model, foot }, frame) {
         const { renderer } = this;
-        const alpha = agent.state === "LOST" ? 0.4 : 1;
+        const alpha = agent.isPosed ? 1 : 0.35;
         const path = this.#paths.get(agent.name);
         if (path) renderer.drawLines(path.lines, identityModel, agent.colour, 0.55 * alpha, 3);
         if (agent.kind === "robot") {
