@@ -387,50 +387,20 @@ def test_a_lost_server_comes_back_and_nothing_is_lost(chromium: Browser, room: H
 
 # ---------------------------------------------------------------- in emulated headsets
 
-SEEN = """(seen = [], () => {
-    const note = () => {
-        requestAnimationFrame(note);
-        const one = [...app.room.objects.values()].find((one) => one.kind === "marker");
-        if (one) seen.push([performance.timeOrigin + performance.now(), one.shown[12], one.shown[13]]);
-    };
-    requestAnimationFrame(note);
-})()"""
-
-
-def first_seen(rows: list[list[float]]) -> dict[tuple[float, float], float]:
-    """Return when each place was drawn first, ms."""
-    times: dict[tuple[float, float], float] = {}
-    for at_ms, x, y in rows:
-        times.setdefault((x, y), at_ms)
-    return times
-
 
 def test_two_wearers_share_a_marker(chromium: Browser, room: HeadsetRoom) -> None:
     room.agents["ben"] = "ar", room.agents["ann"][1]
-    ann, ben = (worn.wear(chromium, room, name) for name in ("ann", "ben"))
+    ann, ben = (worn.wear(chromium, room.url, name) for name in ("ann", "ben"))
     for page in (ann, ben):
         page.wait("app.place.mapId !== null && app.alignmentMm !== null")
         assert worn.drawn_error(page)[0] < 0.002
-        page.app(SEEN)
-    worn.push(ann, "marker")
-    assert ann.app("app.interaction.armed") == "marker"
-    ann.evaluate("aims = { ...aims, at: [0.6, 0, -1.4] }, 0")
-    worn.wait_frames(ann, 3)
-    worn.press(ann, True)
-    ann.evaluate(
-        "(began = performance.now(), drags = () => {"
-        " const s = (performance.now() - began) / 3000;"
-        " aims = { ...aims, at: [0.6 - s, 0, -1.4 - 0.8 * s] }; }, 0)"
-    )
-    time.sleep(3.0)
-    ann.evaluate("drags = null")
-    worn.press(ann, False)
+        page.app(worn.SEEN)
+    worn.drag_marker(ann, 3.0)
     target = worn.T_map_local @ [*ann.evaluate("aims.at"), 1]
     (marker,) = room.objects.values()
     assert marker["owner"] == "ann" and np.allclose(marker["position"], target[:3], atol=0.01)
     ben.wait(f"Math.abs([...app.room.objects.values()][0].T[12] - {marker['position'][0]}) < 1e-6")
-    drawn, seen = (first_seen(page.evaluate("seen")) for page in (ann, ben))
-    late = np.array([at_ms - drawn[place] for place, at_ms in seen.items() if place in drawn])
+    late = worn.lateness_ms(ann, ben)
     print(f"drawn by the other after {np.percentile(late, [50, 95]).round(1)} ms, {len(late)} places")
     assert len(late) > 40 and np.median(late) < 60
     assert ann.problems == ben.problems == []
@@ -439,7 +409,7 @@ def test_two_wearers_share_a_marker(chromium: Browser, room: HeadsetRoom) -> Non
 def test_the_room_stays_where_it_is(chromium: Browser, room: HeadsetRoom) -> None:
     """While the wearer walks; the space is recentred in mid-drag; by its own tracking and by SHARE's."""
     walk = room.agents["ann"][1]
-    page = worn.wear(chromium, room, "ann")
+    page = worn.wear(chromium, room.url, "ann")
     walk.walks = True
     page.evaluate("walks = true")
     time.sleep(2.5)
@@ -476,7 +446,7 @@ def test_the_room_stays_where_it_is(chromium: Browser, room: HeadsetRoom) -> Non
 
 
 def test_hands_place_a_cube_and_the_panel_commands(chromium: Browser, room: HeadsetRoom) -> None:
-    page = worn.wear(chromium, room, "ann")
+    page = worn.wear(chromium, room.url, "ann")
     page.wait("app.place.mapId !== null")
     worn.push(page, "here")
     goto = room.of_type("goto")[0]
@@ -505,13 +475,13 @@ def test_a_wrong_mount_is_said(chromium: Browser, room: HeadsetRoom) -> None:
     wrong = worn.T_body_viewer @ se3.exp(np.array([np.radians(6), 0, np.radians(6), 0, 0, 0]))
     walk = worn.Walk(wrong)
     walk.walks, room.agents["ann"] = True, ("ar", walk)
-    page = worn.wear(chromium, room, "ann")
+    page = worn.wear(chromium, room.url, "ann")
     page.evaluate("walks = true")
     page.wait("app.placement.isContradicted", 15)
 
 
 def test_script_time_and_memory_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
-    page = worn.wear(chromium, room, "ann")
+    page = worn.wear(chromium, room.url, "ann")
     for k in range(16):
         room.put(100 + k, "cube", "ann", se3.from_rt(np.eye(3), np.array([1 + 0.3 * k, 1.0, -1])))
     page.wait("app.room.objects.size === 16 && app.place.mapId !== null")
@@ -525,7 +495,7 @@ def test_script_time_and_memory_of_a_frame(chromium: Browser, room: HeadsetRoom)
 def test_memory_does_not_grow(chromium: Browser, room: HeadsetRoom) -> None:
     """In two minutes of walking and dragging; after collection."""
     walk = room.agents["ann"][1]
-    page = worn.wear(chromium, room, "ann")
+    page = worn.wear(chromium, room.url, "ann")
     walk.walks = True
     page.evaluate("walks = true")
     page.app("app.interaction.arm('marker')")

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 IWER = "iwer@2.5.0"
 _CALL_S = 120.0  # on a busy machine
@@ -52,7 +52,7 @@ class BrowserPage:
     """A tab. `problems`: what its scripts said of errors, and what its content policy refused."""
 
     def __init__(self, endpoint: str) -> None:
-        self._connection, self._number = connect(endpoint, max_size=None, ping_interval=None, open_timeout=_CALL_S), 0
+        self._connection, self._number = _connect(endpoint), 0
         self.problems = list[str]()
         for domain in ("Runtime", "Page", "Log"):
             self.call(f"{domain}.enable")
@@ -104,8 +104,9 @@ class BrowserPage:
 
     def click(self, selector: str) -> None:
         box = self.evaluate(
-            f"((one) => {{ one.scrollIntoView({{ block: 'center' }}); const box = one.getBoundingClientRect();"
-            f"return [box.x + box.width / 2, box.y + box.height / 2]; }})(document.querySelector({selector!r}))"
+            "((one) => { one.scrollIntoView({ block: 'center' }); const box = one.getBoundingClientRect();"
+            " return [box.x + box.width / 2, box.y + box.height / 2]; })"
+            f"(document.querySelector({selector!r}))"
         )
         self.mouse("mousePressed", *box)
         self.mouse("mouseReleased", *box)
@@ -144,7 +145,7 @@ class Browser:
         """Open a URL in a window of its own. emulator: that makes it a headset's browser."""
         listing = f"http://127.0.0.1:{self._port}/json/version"
         with urllib.request.urlopen(listing) as answer:
-            whole = connect(json.load(answer)["webSocketDebuggerUrl"], max_size=None, open_timeout=_CALL_S)
+            whole = _connect(json.load(answer)["webSocketDebuggerUrl"])
         with whole:
             order = {"url": "about:blank", "newWindow": True, "width": width, "height": height}
             whole.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": order}))
@@ -181,6 +182,10 @@ def browser() -> Iterator[Browser]:
         cleanup.callback(process.wait, 30)
         cleanup.callback(process.terminate)
         yield Browser(_devtools_port(profile), cleanup)
+
+
+def _connect(endpoint: str) -> ClientConnection:
+    return connect(endpoint, max_size=None, ping_interval=None, open_timeout=_CALL_S)
 
 
 def _devtools_port(profile: Path) -> int:

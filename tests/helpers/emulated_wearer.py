@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 from helpers.browser import Browser, BrowserPage, emulator
-from helpers.headset_room import CODE, HeadsetRoom, Pose
+from helpers.headset_room import CODE, Pose
 
 from share.geometry import se3
 from share.types import F64
@@ -85,11 +87,13 @@ def pair(page: BrowserPage, name: str, agent: str = "", code: str = CODE) -> Non
     page.click("#pairing button")
 
 
-def wear(browser: Browser, room: HeadsetRoom, name: str, size: tuple[int, int] = (480, 240)) -> BrowserPage:
+def wear(
+    browser: Browser, url: str, name: str, code: str = CODE, size: tuple[int, int] = (480, 240)
+) -> BrowserPage:
     """Open the page in an emulated headset, pair as wearer and agent `name`, and enter."""
-    page = browser.page(room.url, *size, emulator())
+    page = browser.page(url, *size, emulator())
     page.evaluate(f"(() => {{{_SCRIPT}}})()")
-    pair(page, name, name)
+    pair(page, name, name, code)
     page.wait("app.connection.isConnected && app.connection.clock.isKnown")
     page.wait("!document.getElementById('enter').hidden")
     page.click("#enter")
@@ -129,3 +133,40 @@ def push(page: BrowserPage, button: str) -> None:
     wait_frames(page, 3)
     press(page, True)
     press(page, False)
+
+
+def drag_marker(page: BrowserPage, seconds: float) -> None:
+    """Place a marker by the panel and drag it along the floor for so long, 1.3 m."""
+    push(page, "marker")
+    page.evaluate("aims = { ...aims, at: [0.6, 0, -1.4] }, 0")
+    wait_frames(page, 3)
+    press(page, True)
+    page.evaluate(
+        "(began = performance.now(), drags = () => {"
+        f" const s = Math.min((performance.now() - began) / {1000 * seconds}, 1);"
+        " aims = { ...aims, at: [0.6 - s, 0, -1.4 - 0.8 * s] }; }, 0)"
+    )
+    time.sleep(seconds)
+    page.evaluate("drags = null")
+    wait_frames(page, 2)
+    press(page, False)
+
+
+# Notes when a marker is drawn where, ms of the wall clock.
+SEEN = """(seen = [], () => {
+    const note = () => {
+        requestAnimationFrame(note);
+        const one = [...app.room.objects.values()].find((one) => one.kind === "marker");
+        if (one) seen.push([performance.timeOrigin + performance.now(), one.shown[12], one.shown[13]]);
+    };
+    requestAnimationFrame(note);
+})()"""
+
+
+def lateness_ms(first: BrowserPage, second: BrowserPage) -> F64:
+    """Return how much later than the first page the second drew what both have drawn, ms, by `SEEN`."""
+    drawn, seen = ({} for _ in range(2))
+    for times, page in ((drawn, first), (seen, second)):
+        for at_ms, x, y in page.evaluate("seen"):
+            times.setdefault((round(x, 4), round(y, 4)), at_ms)
+    return np.array([at_ms - drawn[place] for place, at_ms in seen.items() if place in drawn])
