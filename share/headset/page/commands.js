@@ -6,7 +6,6 @@ export class Commands {
     robot = null;  // that is sent; null: the only one
     notice = { text: "", sinceMs: -Infinity };
 
-    // app: {room, connection, interaction, place, placement, may}; head: where the wearer is in the map, or null.
     constructor(app) {
         this.app = app;
         const { interaction, room } = app;
@@ -58,9 +57,9 @@ export class Commands {
             return;
         }
         const { x, y, aheadX, aheadY } = head;
-        const robot = [...this.app.room.agents.values()].find(
-            (one) => one.kind === "robot" && one.mapId === this.app.place.mapId && (this.robot ?? one.name) === one.name,
-        );
+        const isMeant = (one) => one.kind === "robot" && one.mapId === this.app.place.mapId;
+        const robots = [...this.app.room.agents.values()].filter(isMeant);
+        const robot = robots.find((one) => (this.robot ?? one.name) === one.name);
         const [dx, dy] = robot ? [robot.T[12] - x, robot.T[13] - y] : [aheadX, aheadY];
         const distance = Math.hypot(dx, dy) || 1;
         if (robot && distance <= KEEP_OFF_M) {

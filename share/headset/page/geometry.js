@@ -10,7 +10,9 @@ function solid(faces) {
         const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
         const length = Math.hypot(...n);
         const normal = n.map((value) => value / length);
-        for (let k = 2; k < corners.length; k++) for (const p of [a, corners[k - 1], corners[k]]) out.push(...p, ...normal);
+        for (let k = 2; k < corners.length; k++) {
+            for (const p of [a, corners[k - 1], corners[k]]) out.push(...p, ...normal);
+        }
     }
     return new Float32Array(out);
 }
@@ -47,10 +49,11 @@ const back = visor.map(([x, y]) => [x, y, -0.05]);
 const [deck, base] = [ring(0.17, 0.12), ring(0.17, 0.02)];
 const mast = [[-0.11, -0.07], [-0.05, -0.07], [-0.05, 0.07], [-0.11, 0.07]];
 const [mastTop, mastFoot] = [0.3, 0.12].map((z) => mast.map(([x, y]) => [x, y, z]));
-const arrow = [[0.5, 0, 0.02], [0.3, 0.11, 0.02], [0.3, 0.04, 0.02], [0.2, 0.04, 0.02], [0.2, -0.04, 0.02], [0.3, -0.04, 0.02], [0.3, -0.11, 0.02]];
+const arrowHead = [[0.5, 0, 0.02], [0.3, 0.11, 0.02], [0.3, -0.11, 0.02]];
+const arrowShaft = [[0.3, 0.04, 0.02], [0.2, 0.04, 0.02], [0.2, -0.04, 0.02], [0.3, -0.04, 0.02]];
 
 const pin = ring(0.045, 0.42, 24);
-const tip = [0, 0, 0.06];
+const pinSides = (apex) => pin.map((p, k) => [p, pin[(k + 1) % pin.length], apex]);
 
 const reversed = (corners) => [...corners].reverse();
 
@@ -59,8 +62,8 @@ export const SOLIDS = {
     frustum: solid(far.map((p, k) => [eye, p, far[(k + 1) % 4]])),
     visor: solid([visor, reversed(back), ...wall(visor, back)]),
     robot: solid([deck, ...wall(deck, base), mastTop, ...wall(mastTop, mastFoot)]),
-    arrow: solid([[arrow[0], arrow[1], arrow[6]], arrow.slice(2, 6)]),
-    pin: solid([...pin.map((p, k) => [tip, pin[(k + 1) % pin.length], p].reverse()), ...pin.map((p, k) => [p, pin[(k + 1) % pin.length], [0, 0, 0.5]])]),
+    arrow: solid([arrowHead, arrowShaft]),
+    pin: solid([...pinSides([0, 0, 0.06]).map(reversed), ...pinSides([0, 0, 0.5])]),
     disc: solid([ring(0.2, 0.004)]),
     dot: solid([ring(1, 0)]),
 };
@@ -71,5 +74,5 @@ export const LINES = {
     robot: [...loop(deck)],
     ring: loop(ring(0.2, 0.006)),
     ray: [0, 0, 0, 0, 0, -1],
-    grid: Array.from({ length: 41 }, (_, k) => k - 20).flatMap((k) => [...[k, -20, 0, k, 20, 0], ...[-20, k, 0, 20, k, 0]]),
+    grid: Array.from({ length: 41 }, (_, k) => k - 20).flatMap((k) => [k, -20, 0, k, 20, 0, -20, k, 0, 20, k, 0]),
 };

@@ -15,7 +15,8 @@ export function stateLines(app) {
     const ms = latency.summary;
     if (ms !== null) {
         const over = Math.round((100 * ms.over_20ms) / ms.frames);
-        lines.push([`pose to frame ${ms.p50_ms.toFixed(0)} ms, 95 % ${ms.p95_ms.toFixed(0)} ms; ${over} % over 20 ms`, DIM]);
+        const [p50, p95] = [ms.p50_ms, ms.p95_ms].map((value) => value.toFixed(0));
+        lines.push([`pose to frame ${p50} ms, 95 % ${p95} ms; ${over} % over 20 ms`, DIM]);
     }
     const robot = [...room.commands.values()].at(-1) ?? [...room.robots.values()].at(-1);
     if (robot) lines.push([`${robot.robot}: ${room.words(robot.robot)}`, PLAIN]);

@@ -151,7 +151,8 @@ export class Interaction {
         const distance = this.#reach(pointer, grab.planeZ);
         if (distance === null) return false;
         pointer.reach = distance;
-        for (let i = 0; i < 2; i++) grab.T[12 + i] = pointer.origin[i] + pointer.direction[i] * distance + grab.shift[i];
+        const { origin, direction } = pointer;
+        for (let i = 0; i < 2; i++) grab.T[12 + i] = origin[i] + direction[i] * distance + grab.shift[i];
         grab.T[14] = grab.planeZ;
         return true;
     }

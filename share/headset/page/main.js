@@ -29,6 +29,7 @@ class App {
     script = new Latency();  // what a frame takes here
     session = null;
     frames = 0;
+    #flatHandle = 0;
     #space = null;
     #pointers = new Map();  // by input source
     #shownPointers = [];
@@ -54,7 +55,7 @@ class App {
         setInterval(() => this.#measure(), MEASURED_MS);
         setInterval(() => this.hud.update(), HUD_MS);
         this.hud.update();
-        requestAnimationFrame((timeMs) => this.#drawFlat(timeMs));
+        this.#beginFlat();
         const asked = navigator.xr?.isSessionSupported("immersive-ar") ?? Promise.resolve(false);
         asked.then((canEnter) => this.hud.setCanEnter(canEnter));
     }
@@ -94,7 +95,7 @@ class App {
                 this.wearer = this.interaction.owner = message.name;
                 this.may = message.may;
                 this.interaction.may = message.may.objects;
-                this.placement.setMount(message.T_body_viewer && fromRows(message.T_body_viewer), message.mount_timeshift_ms);
+                this.#setMount(message.T_body_viewer, message.mount_timeshift_ms);
                 break;
             case "refused":
                 this.session?.end();
@@ -114,6 +115,10 @@ class App {
         for (const { reason } of this.room.removals.splice(0)) this.commands.tell(reason);
     }
 
+    #setMount(rows, timeshiftMs) {
+        this.placement.setMount(rows && fromRows(rows), timeshiftMs);
+    }
+
     #onJoined(oldId, newId, T_new_old) {
         if (this.place.mapId === oldId) this.interaction.joined(T_new_old);
         this.placement.joined(oldId, newId, T_new_old);
@@ -123,8 +128,8 @@ class App {
         const timeMs = this.connection.clock.toPage(pose.t_ms);
         if (timeMs === null || pose.map_id === null) return;
         const cov = new Float64Array(36);
-        const variances = [pose.sigma_rad ?? USUAL_SIGMA_RAD, pose.sigma_m ?? USUAL_SIGMA_M].map((sigma) => sigma ** 2 / 3);
-        for (let i = 0; i < 6; i++) cov[7 * i] = variances[i < 3 ? 0 : 1];  // sigmas are of three axes together
+        const sigmas = [pose.sigma_rad ?? USUAL_SIGMA_RAD, pose.sigma_m ?? USUAL_SIGMA_M];  // of three axes together
+        for (let i = 0; i < 6; i++) cov[7 * i] = sigmas[i < 3 ? 0 : 1] ** 2 / 3;
         this.placement.addPose({
             timeMs,
             cov,
@@ -145,9 +150,14 @@ class App {
 
     // ------------------------------------------------------------ flat
 
-    #drawFlat(timeMs) {
+    #beginFlat() {
+        cancelAnimationFrame(this.#flatHandle);
+        this.#flatHandle = requestAnimationFrame(this.#drawFlat);
+    }
+
+    #drawFlat = (timeMs) => {
         if (this.isInHeadset) return;
-        requestAnimationFrame((nextMs) => this.#drawFlat(nextMs));
+        this.#flatHandle = requestAnimationFrame(this.#drawFlat);
         const beganMs = performance.now();
         const { canvas, preview, renderer, place, room } = this;
         const ratio = Math.min(devicePixelRatio, 2);
@@ -164,10 +174,11 @@ class App {
         gl.bindFramebuffer(gl.FRAMEBUFFER, null);
         gl.clearColor(0, 0, 0, 0);
         gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-        renderer.beginView(0, 0, width, height, multiply(this.#viewProjection, preview.projection, preview.T_camera_map));
+        multiply(this.#viewProjection, preview.projection, preview.T_camera_map);
+        renderer.beginView(0, 0, width, height, this.#viewProjection);
         this.scene.draw(this.#frame);
         this.#noteFrame(beganMs, timeMs, room.agents.get(room.ownAgent));
-    }
+    };
 
     #positions() {
         const { agents, objects } = this.room;
@@ -200,28 +211,38 @@ class App {
     // ------------------------------------------------------------ in the headset
 
     async enterHeadset() {
-        const session = await navigator.xr
-            .requestSession("immersive-ar", { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking"] })
-            .catch((error) => this.commands.tell(`the headset did not begin: ${error.message}`));
-        if (!session) return;
+        let session = null;
+        try {
+            const features = { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking"] };
+            session = await navigator.xr.requestSession("immersive-ar", features);
+            await this.#begin(session);
+        } catch (error) {
+            session?.end();
+            this.commands.tell(`AR did not begin: ${error.message}`);
+        }
+    }
+
+    leaveHeadset() {
+        this.session?.end();
+    }
+
+    async #begin(session) {
         const gl = this.renderer.gl;
         await gl.makeXRCompatible();
         session.updateRenderState({ baseLayer: new XRWebGLLayer(session, gl), depthNear: 0.05, depthFar: 100 });
         this.#space = await session.requestReferenceSpace("local-floor");
         this.#space.addEventListener("reset", () => this.#onReset());
-        session.addEventListener("end", () => this.#onEnd());
+        session.addEventListener("end", () => this.#onEnd(session));
         session.addEventListener("selectstart", ({ inputSource }) => (this.#pointerOf(inputSource).wants = "press"));
         session.addEventListener("selectend", ({ inputSource }) => (this.#pointerOf(inputSource).wants = "release"));
-        session.addEventListener("inputsourceschange", ({ removed }) => removed.forEach((one) => this.#dropPointer(one)));
+        session.addEventListener("inputsourceschange", ({ removed }) => {
+            for (const inputSource of removed) this.#dropPointer(inputSource);
+        });
         this.session = session;
         this.interaction.panel = this.panel;
         this.panel.forget();
         this.#onReset();
-        session.requestAnimationFrame((timeMs, frame) => this.#drawInHeadset(timeMs, frame));
-    }
-
-    leaveHeadset() {
-        this.session?.end();
+        session.requestAnimationFrame(this.#drawInHeadset);
     }
 
     #onReset() {
@@ -229,17 +250,18 @@ class App {
         this.panel.forget();
     }
 
-    #onEnd() {
+    #onEnd(session) {
+        if (this.session !== session) return;
         for (const inputSource of [...this.#pointers.keys()]) this.#dropPointer(inputSource);
         this.session = this.interaction.panel = null;
         this.alignmentMm = this.driftMmS = null;
-        requestAnimationFrame((timeMs) => this.#drawFlat(timeMs));
+        this.#beginFlat();
     }
 
-    #drawInHeadset(timeMs, frame) {
+    #drawInHeadset = (timeMs, frame) => {
         const { session, renderer, place, placement, panel } = this;
         if (session === null) return;
-        session.requestAnimationFrame((nextMs, next) => this.#drawInHeadset(nextMs, next));
+        session.requestAnimationFrame(this.#drawInHeadset);
         const beganMs = performance.now();
         const viewer = frame.getViewerPose(this.#space);
         if (!viewer) return;  // the headset has lost itself
@@ -261,13 +283,14 @@ class App {
         for (const view of viewer.views) {
             const { x, y, width, height } = layer.getViewport(view);
             inverse(this.#T_view_map, multiply(this.#T_view_map, place.T_map_local, view.transform.matrix));
-            renderer.beginView(x, y, width, height, multiply(this.#viewProjection, view.projectionMatrix, this.#T_view_map));
+            multiply(this.#viewProjection, view.projectionMatrix, this.#T_view_map);
+            renderer.beginView(x, y, width, height, this.#viewProjection);
             this.scene.draw(this.#frame);
         }
         this.alignmentMm = placement.sigmaMm(this.#T_local_viewer);
         this.driftMmS = placement.driftMmS(this.#T_local_viewer, displayMs);
         this.#noteFrame(beganMs, displayMs, this.room.agents.get(this.room.ownAgent));
-    }
+    };
 
     // Without a place in the map the panel is drawn all the same.
     #setPlace() {
@@ -275,8 +298,8 @@ class App {
         place.mapId = placement.mapId;
         if (place.mapId === null) inverse(place.T_map_local, T_xr_map);
         else place.T_map_local.set(placement.T_map_local);
-        const below = transformPoint(this.#eye, place.T_map_local, [this.#T_local_viewer[12], 0, this.#T_local_viewer[14]]);
-        place.floorZ = below[2];  // of local-floor, under the wearer
+        const foot = [this.#T_local_viewer[12], 0, this.#T_local_viewer[14]];  // in local-floor, under the wearer
+        place.floorZ = transformPoint(foot, place.T_map_local, foot)[2];
     }
 
     #updatePointers(frame, nowMs) {

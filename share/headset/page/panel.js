@@ -1,5 +1,5 @@
-// The panel that floats before the wearer: lines of state, and buttons that a ray hits. It stays where it is while it is
-// looked at, and comes along when the wearer turns or walks away.
+// The panel that floats before the wearer: lines of state, and buttons that a ray hits. It stays where it is while one
+// looks at it, and comes along when the wearer turns or walks away.
 import { identity, inverse, multiply, transformPoint } from "./math.js";
 
 const [WIDTH_M, HEIGHT_M] = [0.48, 0.36];

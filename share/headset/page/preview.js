@@ -83,7 +83,8 @@ export class Preview {
     #fingerOf(event) {
         let finger = this.#fingers.get(event.pointerId);
         if (finger === undefined) {
-            const pointer = { origin: [0, 0, 0], direction: [0, 0, -1], T_map_pointer: null, isPressed: false, reach: null };
+            const state = { T_map_pointer: null, isPressed: false, reach: null };
+            const pointer = { origin: [0, 0, 0], direction: [0, 0, -1], ...state };
             finger = { pointer, isTurning: false, button: 0 };
             this.#fingers.set(event.pointerId, finger);
         }

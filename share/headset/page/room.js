@@ -221,8 +221,8 @@ const scratch = identity();
 
 // isHeld: the page's own copy counts; isGrabbed: a hand has it; confirmed: what the edge holds.
 function newObject(id, kind, owner) {
-    const flags = { isHeld: false, isGrabbed: false, isToEase: false };
-    return { id, kind, owner, mapId: null, T: identity(), shown: new Float32Array(16), request: null, confirmed: null, ease: null, ...flags };
+    const place = { mapId: null, T: identity(), shown: new Float32Array(16), ease: null, confirmed: null };
+    return { id, kind, owner, ...place, request: null, isHeld: false, isGrabbed: false, isToEase: false };
 }
 
 // Let the edge's copy count; after a join, by an ease.

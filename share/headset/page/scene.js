@@ -34,8 +34,7 @@ export class Scene {
         this.#count = 0;
         for (const agent of this.room.agents.values()) {
             if (agent.mapId !== mapId) continue;
-            const item = (this.#items[this.#count] ??= { T: identity(), model: new Float32Array(16), foot: new Float32Array(16) });
-            this.#count++;
+            const item = (this.#items[this.#count++] ??= newItem());
             item.agent = agent;
             const stampMs = clock.toPage(agent.stampMs);
             const aheadS = stampMs === null ? 0 : (displayMs - stampMs) / 1000;
@@ -58,7 +57,9 @@ export class Scene {
         if (frame.mapId !== null) {
             if (frame.isFlat) this.#drawGrid(frame);
             for (let k = 0; k < this.#count; k++) this.#drawAgent(this.#items[k], frame);
-            for (const object of room.objects.values()) if (object.mapId === frame.mapId) this.#drawObject(object, frame);
+            for (const object of room.objects.values()) {
+                if (object.mapId === frame.mapId) this.#drawObject(object, frame);
+            }
             if (this.#points && room.points.mapId === frame.mapId) {
                 renderer.drawPoints(this.#points, identityModel, POINTS, 0.99);
             }
@@ -129,7 +130,8 @@ export class Scene {
         }
         for (const { mapId, kind, owner, shown } of room.objects.values()) {
             if (mapId !== frame.mapId) continue;
-            this.#drawLabel(owner, shown[12], shown[13], shown[14] + (kind === "marker" ? 0.55 : 0.15), frame, OWNER, 0);
+            const height = kind === "marker" ? 0.55 : 0.15;
+            this.#drawLabel(owner, shown[12], shown[13], shown[14] + height, frame, OWNER, 0);
         }
     }
 
@@ -201,4 +203,5 @@ export class Scene {
     }
 }
 
+const newItem = () => ({ agent: null, T: identity(), model: new Float32Array(16), foot: new Float32Array(16) });
 const identityModel = new Float32Array(identity());
