@@ -18,7 +18,7 @@ from share.view import events as ev
 from share.wire.room_messages import Permission
 
 served_page = pytest.importorskip("share.headset.headset_page")
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 @contextmanager

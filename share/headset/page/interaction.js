@@ -159,6 +159,7 @@ export class Interaction {
 
     #put(grab, nowMs) {
         const object = this.room.objects.get(grab.id);
+        if (!object.T.every(Number.isFinite)) return;  // a ray that a headset has lost
         object.request = this.connection.put(object.id, object.kind, object.mapId, ...poseOf(object.T));
         grab.putMs = nowMs;
     }

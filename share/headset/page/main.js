@@ -15,6 +15,7 @@ import { Scene } from "./scene.js";
 
 const MEASURED_MS = 2000;
 const HUD_MS = 200;
+const MAX_AGE_MS = 10000;  // of a pose; beyond, nothing comes: not a latency
 const STOP_BUTTON = 5;  // B and Y of xr-standard gamepads
 const USUAL_SIGMA_M = 0.01;  // of a pose that names none
 const USUAL_SIGMA_RAD = 0.004;
@@ -205,7 +206,8 @@ class App {
         const nowMs = performance.now();
         this.script.add(nowMs - beganMs);
         const poseMs = own?.isPosed ? this.connection.clock.toPage(own.stampMs) : null;
-        if (poseMs !== null) this.latency.add(Math.max(nowMs, displayMs) - poseMs);
+        const ageMs = Math.max(nowMs, displayMs) - poseMs;
+        if (poseMs !== null && ageMs < MAX_AGE_MS) this.latency.add(Math.max(ageMs, 0));  // clocks may err by a little
     }
 
     // ------------------------------------------------------------ in the headset
