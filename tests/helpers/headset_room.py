@@ -43,7 +43,14 @@ class HeadsetRoom:
         self._seats = dict[str, ServerConnection]()
         self._names = dict[str, tuple[str, str | None]]()
         self._lock, self._ended = threading.RLock(), threading.Event()
-        self._server: Server = serve(self._serve, "127.0.0.1", port, process_request=self._answer, ping_interval=None, open_timeout=None)
+        self._server: Server = serve(
+            self._serve,
+            "127.0.0.1",
+            port,
+            process_request=self._answer,
+            ping_interval=None,
+            open_timeout=None,
+        )
         self.port = self._server.socket.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}/"
 
