@@ -121,8 +121,11 @@ class App {
     }
 
     #onJoined(oldId, newId, T_new_old) {
-        if (this.place.mapId === oldId) this.interaction.joined(T_new_old);
         this.placement.joined(oldId, newId, T_new_old);
+        if (this.place.mapId !== oldId) return;
+        this.place.mapId = newId;
+        multiply(this.place.T_map_local, T_new_old, this.place.T_map_local);
+        this.interaction.joined(T_new_old);
     }
 
     #onOwnPose(pose) {

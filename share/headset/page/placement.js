@@ -28,6 +28,7 @@ export class Placement {
     isPredicting = true;  // in follow
     mapId = null;  // of what is drawn; null: the headset's place is not known
     T_map_local = identity();  // as drawn
+    alignment = null;
     history = new ViewerHistory();
     #pose = null;  // the newest of the own device, {timeMs, mapId, T_map_body, cov, velocity, angularVelocity}
     #waiting = [];
@@ -45,11 +46,14 @@ export class Placement {
         this.setMount(null, 0);
     }
 
-    // T_body_viewer: null where none was calibrated. timeshiftMs: the device's clock less the headset's.
+    // T_body_viewer: null where none was calibrated. timeshiftMs: the device's clock less the headset's. The same mount
+    // again, as after a reconnection, changes nothing.
     setMount(T_body_viewer, timeshiftMs) {
+        const mount = T_body_viewer ?? T_body_viewer_nominal;
         this.isCalibrated = T_body_viewer !== null;
         this.timeshiftMs = Math.abs(timeshiftMs ?? 0) <= MAX_TIMESHIFT_MS ? (timeshiftMs ?? 0) : 0;
-        this.alignment = new SpaceAlignment(T_body_viewer ?? T_body_viewer_nominal);
+        if (this.alignment?.T_body_viewer.every((value, k) => value === mount[k])) return;
+        this.alignment = new SpaceAlignment(mount);
     }
 
     setMode(mode) {
