@@ -32,7 +32,17 @@ def chromium() -> Iterator[Browser]:
 def modules(chromium: Browser) -> Iterator[BrowserPage]:
     """A page whose modules a test calls."""
     with HeadsetRoom({}) as one:
-        yield chromium.page(one.url)
+        page = chromium.page(f"{one.url}page.css")  # draws nothing
+        chromium.pages.remove(page)
+        yield page
+        page.close()
+
+
+@pytest.fixture(autouse=True)
+def _closed(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    if "chromium" in request.fixturenames:
+        request.getfixturevalue("chromium").close_pages()
 
 
 @pytest.fixture

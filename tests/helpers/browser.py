@@ -16,11 +16,12 @@ import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 IWER = "iwer@2.5.0"
@@ -58,6 +59,8 @@ class BrowserPage:
             self.call(f"{domain}.enable")
 
     def close(self) -> None:
+        with suppress(ConnectionClosed):
+            self._connection.send(json.dumps({"id": 0, "method": "Page.close"}))
         self._connection.close()
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
@@ -136,8 +139,13 @@ class BrowserPage:
 
 
 class Browser:
-    def __init__(self, port: int, cleanup: ExitStack) -> None:
-        self._port, self._cleanup = port, cleanup
+    def __init__(self, port: int) -> None:
+        self._port, self.pages = port, list[BrowserPage]()
+
+    def close_pages(self) -> None:
+        """Pages that are open draw."""
+        while self.pages:
+            self.pages.pop().close()
 
     def page(
         self, url: str, width: int = 960, height: int = 540, emulator: Path | None = None
@@ -151,7 +159,7 @@ class Browser:
             whole.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": order}))
             target = json.loads(whole.recv(timeout=_CALL_S))["result"]["targetId"]
         page = BrowserPage(f"ws://127.0.0.1:{self._port}/devtools/page/{target}")
-        self._cleanup.callback(page.close)
+        self.pages.append(page)
         page.resize(width, height)
         if emulator is not None:
             page.call("Page.addScriptToEvaluateOnNewDocument", source=emulator.read_text() + _EMULATED)
@@ -181,7 +189,9 @@ def browser() -> Iterator[Browser]:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         cleanup.callback(process.wait, 30)
         cleanup.callback(process.terminate)
-        yield Browser(_devtools_port(profile), cleanup)
+        one = Browser(_devtools_port(profile))
+        cleanup.callback(one.close_pages)
+        yield one
 
 
 def _connect(endpoint: str) -> ClientConnection:

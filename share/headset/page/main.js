@@ -168,7 +168,8 @@ class App {
         const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(side * ratio));
         if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
         place.mapId = room.likelyMap;
-        if (place.mapId !== null) place.floorZ = room.floorHeight(place.mapId);
+        if (place.mapId === null) return;  // the start page: nothing to draw
+        place.floorZ = room.floorHeight(place.mapId);
         if (this.frames % 30 === 0) preview.showAll(this.#positions());
         preview.update(width, height);
         this.interaction.hover(preview.pointers);
