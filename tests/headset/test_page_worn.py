@@ -85,7 +85,7 @@ def test_hands_place_a_cube_and_the_panel_commands(chromium: Browser, room: Head
     goto = room.of_type("goto")[0]
     head = (worn.T_map_local @ worn.viewer_pose(0, False))[:2, 3]
     assert np.linalg.norm(head - [goto["x"], goto["y"]]) == pytest.approx(0.8, abs=0.01)
-    page.evaluate("headset.primaryInputMode = 'hand'")
+    page.evaluate("(headset.primaryInputMode = 'hand', aims = { ...aims, at: [1.5, 1.3, -1] }, 0)")
     worn.wait_frames(page, 5)
     page.app("app.interaction.arm('cube')")
     worn.press(page, True, hand=True)

@@ -35,6 +35,11 @@ _SCRIPT = """
         const [sa, ca, sb, cb] = [Math.sin(a), Math.cos(a), Math.sin(b), Math.cos(b)];
         one.quaternion.set(ca * sb, sa * cb, -sa * sb, ca * cb);
     };
+    window.unspaced = ([x, y, z]) => {
+        const { space } = window;
+        const [s, c] = [Math.sin(space.yaw), Math.cos(space.yaw)];
+        return [c * (x - space.x) - s * (z - space.z), y, s * (x - space.x) + c * (z - space.z)];
+    };
     window.aimed = (hand, { at, from }) => {
         const d = [0, 1, 2].map((i) => at[i] - from[i]);
         set(hand, from, Math.atan2(-d[0], -d[2]), Math.asin(d[1] / Math.hypot(...d)));
@@ -129,7 +134,7 @@ def wait_frames(page: BrowserPage, count: int) -> None:
 
 def push(page: BrowserPage, button: str) -> None:
     """Point at a button of the panel and press it."""
-    page.app(f"(aims = {{ ...aims, at: app.panel.centreOf({button!r}) }}, 0)")
+    page.app(f"(aims = {{ ...aims, at: unspaced(app.panel.centreOf({button!r})) }}, 0)")
     wait_frames(page, 3)
     press(page, True)
     press(page, False)
