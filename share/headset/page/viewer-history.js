@@ -1,0 +1,51 @@
+// Poses of the viewer in the headset's own space, of the last seconds, by the time that they are of.
+import { fromPose, quaternionOf, slerp } from "./math.js";
+
+const KEPT = 256;  // two seconds at 120 Hz
+const MAX_GAP_MS = 100;  // between two poses; beyond, what was between them is not known
+
+export class ViewerHistory {
+    #times = new Float64Array(KEPT);
+    #positions = new Float64Array(3 * KEPT);
+    #quaternions = new Float64Array(4 * KEPT);
+    #count = 0;
+    #position = new Float64Array(3);
+    #quaternion = new Float64Array(4);
+
+    add(timeMs, T_local_viewer) {
+        if (this.#count > 0 && timeMs <= this.#times[(this.#count - 1) % KEPT]) return;
+        const k = this.#count++ % KEPT;
+        this.#times[k] = timeMs;
+        this.#positions.set(T_local_viewer.subarray(12, 15), 3 * k);
+        quaternionOf(this.#quaternion, T_local_viewer);
+        this.#quaternions.set(this.#quaternion, 4 * k);
+    }
+
+    forget() {
+        this.#count = 0;
+    }
+
+    // Whether a pose of `timeMs` may still come to lie between two.
+    isBefore(timeMs) {
+        return this.#count === 0 || this.#times[(this.#count - 1) % KEPT] < timeMs;
+    }
+
+    // T_local_viewer at a time, between the two poses about it; null outside or in a gap.
+    at(timeMs) {
+        for (let n = this.#count - 1; n > 0 && n > this.#count - KEPT; n--) {
+            const [i, j] = [(n - 1) % KEPT, n % KEPT];
+            if (this.#times[i] > timeMs) continue;
+            const gapMs = this.#times[j] - this.#times[i];
+            if (this.#times[j] < timeMs || gapMs > MAX_GAP_MS) return null;
+            const share = (timeMs - this.#times[i]) / gapMs;
+            for (let c = 0; c < 3; c++) {
+                const from = this.#positions[3 * i + c];
+                this.#position[c] = from + share * (this.#positions[3 * j + c] - from);
+            }
+            const ends = [i, j].map((k) => this.#quaternions.subarray(4 * k, 4 * k + 4));
+            slerp(this.#quaternion, ...ends, share);
+            return fromPose(new Float64Array(16), this.#position, this.#quaternion);
+        }
+        return null;
+    }
+}
