@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from share.config import Config
 from share.errors import UsageError
 from share.geometry.se3 import inverse
+from share.lab.emulate.recipe import Progress
 from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.types import START_NS
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
@@ -46,8 +47,6 @@ _ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
 _FRAME_HZ = 15.0  # of a robot that knows its true place
 _STEP_S = 0.5
 _CAMERA_M = (0.09, 0.018, 0.21)
-
-Show = Callable[[str, float], None]  # what goes on, session time s
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +103,7 @@ class EmulatedRobotAgent:
 
 @dataclass(frozen=True, eq=False)
 class LoopRun:
-    """A finished run. giver: with the goals' outcomes."""
+    """A run, before or after its drive. giver: with the goals' outcomes."""
 
     options: LoopOptions
     loop: RobotLoop
@@ -114,35 +113,39 @@ class LoopRun:
     def outcomes(self) -> list[GoalOutcome]:
         return self.giver.outcomes
 
+    def drive(self) -> Iterator[float]:
+        """Go on, and yield the session time, s, every so often, until all goals have their end or the run
+        has."""
+        now_s = 0.0
+        while now_s < self.options.seconds and not self.giver.is_done:
+            now_s += _STEP_S
+            self.loop.run(now_s)
+            yield now_s
 
-def simulate(
-    session: Session,
+
+def prepare_run(
+    session: Session | None,
     room: EmulatedRoom,
     options: LoopOptions,
     config: Config,
     robot: RobotSettings,
-    show: Show,
+    progress: Progress,
 ) -> LoopRun:
-    """Send a robot about in a session's room. Deterministic for given options. Raises UsageError."""
-    loop, giver = prepare_loop(session, room, options, config, robot, show)
+    """Return a robot that is to be sent about in a session's room. session: None without pictures, where the
+    robot does not see. Deterministic for given options. Raises UsageError."""
+    loop, giver = _loop(session, room, options, config, robot, progress)
     schedule_faults(loop, options.faults)
-    now_s = 0.0
-    while now_s < options.seconds and not giver.is_done:
-        now_s += _STEP_S
-        loop.run(now_s)
-        show("driving", now_s)
     return LoopRun(options, loop, giver)
 
 
-def prepare_loop(
-    session: Session,
+def _loop(
+    session: Session | None,
     room: EmulatedRoom,
     options: LoopOptions,
     config: Config,
     robot: RobotSettings,
-    show: Show,
+    progress: Progress,
 ) -> tuple[RobotLoop, GoalGiver]:
-    """Return the loop before its start, and who gives the goals."""
     rngs = [np.random.default_rng((options.seed, stream)) for stream in range(4)]
     T_world_base = start_pose(room.grid, room.people_at(0), rngs[0])
     T_base_body = inverse(robot.T_body_base)
@@ -156,7 +159,9 @@ def prepare_loop(
         own_pose = _own_pose(base, options.localisation)
         loop = RobotLoop(config, [], *common, None, network, own_pose, times)
         return loop, GoalGiver(loop, draw, count, points_in_room)
-    members = _people(session, room, config, show)
+    if session is None:
+        raise ValueError("a robot that sees needs the session's recordings")
+    members = _people(session, room, config, progress)
     sensors = _robot_sensors(room, base, options)
     agent = EmulatedRobotAgent(sensors, config, _ROBOT_RUN, lambda text: loop.note(f"agent: {text}"))
     loop = RobotLoop(config, members, *common, agent, network)
@@ -195,11 +200,11 @@ def _goal_source(
     return lambda here: next(given), len(options.goals)
 
 
-def _people(session: Session, room: EmulatedRoom, config: Config, show: Show) -> list[Member]:
+def _people(session: Session, room: EmulatedRoom, config: Config, progress: Progress) -> list[Member]:
     """Return the session's headsets, tracked from their files."""
     members: list[Member] = []
     for number, person in enumerate(room.people, 1):
-        show(f"tracking {person.name}", 0.0)
+        progress(f"tracking {person.name}", number - 1, len(room.people))
         source = open_source(f"{session.folder}/{person.name}")
         offset_ns = session.agents[person.name].clock_offset_ns + START_NS
         rig, frames = track_agent(source, config, offset_ns, config.agent.error_model)
