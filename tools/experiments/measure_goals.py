@@ -37,7 +37,7 @@ from goal_figures import draw_goals, print_tables  # noqa: E402
 from make_keyframe_sets import seeds_of  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
-from share.config import Config  # noqa: E402
+from share.config import STREAMED, Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe, no_progress  # noqa: E402
 from share.lab.emulate.session import default_cache, make_cached_session  # noqa: E402
@@ -50,6 +50,7 @@ from share.scheduling.policies import POLICIES  # noqa: E402
 from share.sensors.profile import shipped_profiles  # noqa: E402
 
 _BLIND = ("truth", "wheels")
+_POLICIES = tuple(name for name in POLICIES if name != STREAMED)  # whose agents track
 _FULL = (640, 480)
 
 Row = dict[str, Any]
@@ -64,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     made.add_argument("--out", type=Path, required=True, metavar="FILE")
     made.add_argument("--seeds", type=seeds_of, default=range(6101, 6111), metavar="FIRST:END")
-    made.add_argument("--runs", nargs="+", choices=(*_BLIND, *POLICIES), default=[*_BLIND, SHARE])
+    made.add_argument("--runs", nargs="+", choices=(*_BLIND, *_POLICIES), default=[*_BLIND, SHARE])
     made.add_argument("--scene", default="warehouse")
     made.add_argument("--goals", type=int, default=10)
     made.add_argument("--mode", default="320x240@15", metavar="WxH@HZ")
