@@ -43,9 +43,9 @@ from share.lab.emulate.recipe import SessionRecipe, no_progress  # noqa: E402
 from share.lab.emulate.session import default_cache, make_cached_session  # noqa: E402
 from share.lab.evaluate.provenance import describe_machine  # noqa: E402
 from share.lab.robot.report import goal_report, run_report  # noqa: E402
-from share.lab.robot.room import open_room  # noqa: E402
+from share.lab.robot.room import EmulatedRoom, open_room  # noqa: E402
 from share.lab.robot.simulate import SHARE, LoopOptions, LoopRun, prepare_run, usual_robot  # noqa: E402
-from share.recordings.session import read_session  # noqa: E402
+from share.recordings.session import Session, read_session  # noqa: E402
 from share.scheduling.policies import POLICIES  # noqa: E402
 from share.sensors.profile import shipped_profiles  # noqa: E402
 
@@ -88,48 +88,55 @@ def tables(options: argparse.Namespace) -> None:
 
 def measure(options: argparse.Namespace) -> None:
     done = {key(row) for row in read_rows(options.out) if row["kind"] == "run"}
-    for run in options.runs:
-        for seed in options.seeds:
-            about = {"scene": options.scene, "seed": seed, "run": run, "mode": mode_of(options, run)}
-            if key(about) not in done:
-                one_run(options, run, seed, about)
+    for seed in options.seeds:
+        wanted = [run for run in options.runs if key(about(options, run, seed)) not in done]
+        if wanted:
+            one_room(options, seed, wanted)
 
 
-def one_run(options: argparse.Namespace, run: str, seed: int, about: Row) -> None:
-    """Drive, and append lines to the file."""
-    began_s, began_cpu_s = time.perf_counter(), time.process_time()
-    recipe = SessionRecipe(
-        options.scene,
-        ("ann=walk:",),
-        options.headset_s,
-        seed,
-        profiles={"": profile_of(options.mode)},
-    )
-    sees = run not in _BLIND
+def about(options: argparse.Namespace, run: str, seed: int) -> Row:
+    """Return what tells runs apart."""
+    mode = None if run in _BLIND else options.mode
+    return {"scene": options.scene, "seed": seed, "run": run, "mode": mode}
+
+
+def one_room(options: argparse.Namespace, seed: int, runs: Sequence[str]) -> None:
+    """Make the room, and drive in it."""
+    began_s = time.perf_counter()
+    profiles = {"": profile_of(options.mode)}
+    recipe = SessionRecipe(options.scene, ("ann=walk:",), options.headset_s, seed, profiles=profiles)
+    sees = any(run not in _BLIND for run in runs)
     session = read_session(make_cached_session(recipe, workers=1)) if sees else None
     room = open_room(recipe, no_progress, has_pictures=sees)
+    print(f"room {seed}: {time.perf_counter() - began_s:.1f} s", flush=True)
+    for run in runs:
+        one_run(options, run, seed, room, session)
+
+
+def one_run(
+    options: argparse.Namespace, run: str, seed: int, room: EmulatedRoom, session: Session | None
+) -> None:
+    """Drive, and append lines to the file."""
+    began_s, began_cpu_s = time.perf_counter(), time.process_time()
+    sees, fields = run not in _BLIND, about(options, run, seed)
     loop_options = LoopOptions(
         SHARE if sees else run, run if sees else SHARE, options.goals, None, seed, options.seconds
     )
     loop_options = replace(loop_options, profile=profile_of(options.mode))
-    made_s = time.perf_counter() - began_s
     driven = prepare_run(session, room, loop_options, Config(), usual_robot(), no_progress)
-    tracked_s = time.perf_counter() - began_s - made_s
     count = 0
     for _ in driven.drive():
         for number in range(count, ended(driven)):
-            append(options.out, {"kind": "goal", **about, "number": number + 1, **goal_row(driven, number)})
+            append(options.out, {"kind": "goal", **fields, "number": number + 1, **goal_row(driven, number)})
             count += 1
     report = run_report(driven, "")
     kept = {name: report[name] for name in report if name not in ("goals", "session", "profile")}
     took = {
-        "made_s": round(made_s, 1),
-        "tracked_s": round(tracked_s, 1),
         "wall_s": round(time.perf_counter() - began_s, 1),
         "cpu_s": round(time.process_time() - began_cpu_s, 1),
     }
     wanted = {"goals": options.goals, "unfinished": len(driven.outcomes) - count}
-    append(options.out, {"kind": "run", **kept, **about, **wanted, **took, "machine": describe_machine()})
+    append(options.out, {"kind": "run", **kept, **fields, **wanted, **took, "machine": describe_machine()})
     print(f"{run} {seed}: {report['reached']} of {count}; {took}", flush=True)
 
 
@@ -143,10 +150,6 @@ def goal_row(run: LoopRun, number: int) -> Row:
     outcome = run.outcomes[number]
     lines = [[round(t, 2), text] for t, text in run.loop.lines if t >= outcome.begun_s - 0.2]
     return goal_report(outcome) | {"lines": lines}
-
-
-def mode_of(options: argparse.Namespace, run: str) -> str | None:
-    return None if run in _BLIND else str(options.mode)
 
 
 def profile_of(mode: str) -> str:

@@ -18,7 +18,7 @@ from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.types import START_NS
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
 from share.lab.evaluate.simulation import TrackedFrame
-from share.lab.evaluate.virtual_time import track_agent, tracked_frame
+from share.lab.evaluate.virtual_time import track_session, tracked_frame
 from share.lab.robot.base import RobotBase
 from share.lab.robot.drive import DriveModel
 from share.lab.robot.faults import LoopFault, schedule_faults
@@ -35,7 +35,6 @@ from share.robot.settings import RobotSettings
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate, SynchronousErrorModel
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.runtime.offline_tracking import track_frames
-from share.runtime.source import open_source
 from share.sensors.profile import load_profile
 from share.types import AgentKind
 from share.wire.messages import Hello
@@ -201,15 +200,20 @@ def _goal_source(
 
 
 def _people(session: Session, room: EmulatedRoom, config: Config, progress: Progress) -> list[Member]:
-    """Return the session's headsets, tracked from their files."""
+    """Return the session's headsets, tracked from their files; once where runs follow each other."""
+    if not room.people:
+        return []
+    names = tuple(person.name for person in room.people)
+    progress(f"tracking {', '.join(names)}", 0, 1)
+    settings = config.tracker, config.inertial, config.sequencer
+    tracked = track_session(session.folder.resolve(), *settings, config.agent.error_model, names)
     members: list[Member] = []
     for number, person in enumerate(room.people, 1):
-        progress(f"tracking {person.name}", number - 1, len(room.people))
-        source = open_source(f"{session.folder}/{person.name}")
-        offset_ns = session.agents[person.name].clock_offset_ns + START_NS
-        rig, frames = track_agent(source, config, offset_ns, config.agent.error_model)
+        rig, frames = tracked[person.name]
         hello = Hello(person.name, person.kind, number, rig)
-        members.append((hello, iter(frames), NETWORK_PRESETS[LINK]))
+        arriving = (replace(one, arrival_ns=one.arrival_ns - START_NS) for one in frames)
+        members.append((hello, arriving, NETWORK_PRESETS[LINK]))
+    progress(f"tracking {', '.join(names)}", 1, 1)
     return members
 
 
