@@ -92,8 +92,8 @@ def simulate(
     """
     from share.files.writing import atomic_write, new_folder
     from share.lab.robot.report import draw_run, outcome_rows, run_report, summary_text
-    from share.lab.robot.room import open_room
-    from share.lab.robot.simulate import simulate as run_simulation
+    from share.lab.robot.room import open_room, session_recipe
+    from share.lab.robot.simulate import SHARE, prepare_run
     from share.recordings.session import read_session
 
     config = options.load_config(config_file, [policy])
@@ -101,12 +101,10 @@ def simulate(
     loop_options = replace(loop_options, seed=seed, seconds=seconds, profile=profile)
     robot, opened = _robot(robot_file), read_session(session)
     with new_folder(out) as folder, Stages() as stages:
-        room = open_room(opened, stages)
-
-        def show(stage: str, now_s: float) -> None:
-            stages(stage, int(now_s), round(seconds))
-
-        run = run_simulation(opened, room, loop_options, config, robot, show)
+        room = open_room(session_recipe(opened), stages, has_pictures=localisation == SHARE)
+        run = prepare_run(opened, room, loop_options, config, robot, stages)
+        for now_s in run.drive():
+            stages("driving", int(now_s), round(seconds))
         report = run_report(run, str(session))
         atomic_write(folder / "report.json", json.dumps(report, indent=1) + "\n")
         draw_run(folder / "plan.png", room, run)

@@ -10,6 +10,10 @@ exp(i heading). That is linear in a and b. Wheel odometry's own heading, which d
 direction of one step. A delay of the wheels turns left and right bends against each other, and so falls
 out of an eight. Roll and pitch are those of gravity in the body, since the floor is level; the height
 does not show in such a drive.
+
+`scale` is the camera's error of scale less that of the wheels' diameters, which the drive does not tell
+apart. x and y are by the camera's scale, so the sigma has that part of them beside what the windows show. In
+bends one wheel of another diameter moves the base's middle as another y would: the sigma of y has that too.
 """
 
 from __future__ import annotations
@@ -31,6 +35,8 @@ _MAX_STEP_M = 0.3  # between two poses; more is a jump of the odometry's origin
 _ITERATIONS = 10
 _MIN_WAY_M, _MIN_TURN_DEG, _MIN_BLOCKS = 2.0, 180.0, 4
 _MAX_SIGMA_M, _MAX_SIGMA_DEG, _MAX_SCALE = 0.01, 0.5, 0.1
+_SCALE_SIGMA = 0.005  # of a camera at least: it may err as the wheels do, and the scale then shows less
+_UNEQUAL_WHEELS_M = 0.0004  # of y: a quarter of a Create 3's wheel base, wheels unequal by 0.7 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +72,7 @@ class DriveExtent:
 @dataclass(frozen=True, eq=False)
 class Mounting:
     """T_base_body (4, 4), and one sigma of its parts. scale: of the way by the camera to that by the wheels,
-    less 1. residual_m: rms over a second."""
+    less 1, all of which the sigmas of x and y take for the camera's. residual_m: rms over a second."""
 
     T_base_body: F64
     sigma_yaw_deg: float
@@ -123,7 +129,10 @@ def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
     c, s = np.cos(yaw), np.sin(yaw)
     R_base_level = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     T_base_body = from_rt(R_base_level @ R_body_level.T, np.array([x, y, height_m]))
-    sigmas = float(np.degrees(sigma[0])), float(sigma[1]), float(sigma[2])
+    scale_sigma = max(abs(scale), _SCALE_SIGMA)
+    sigma_x = float(np.hypot(sigma[1], scale_sigma * x))
+    sigma_y = float(np.linalg.norm([sigma[2], scale_sigma * y, _UNEQUAL_WHEELS_M]))
+    sigmas = float(np.degrees(sigma[0])), sigma_x, sigma_y
     return Mounting(T_base_body, *sigmas, sigma_tilt, float(scale), pieces.residual_m(), extent)
 
 

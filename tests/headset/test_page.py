@@ -23,7 +23,8 @@ def test_pairing_says_what_is_wrong_and_a_name_is_a_text(chromium: Browser, room
     page.wait("app.connection.isConnected && app.room.objects.size === 1 && app.room.agents.size === 3")
     page.wait("document.querySelector('#state p')?.textContent === '<b>ann</b>'")
     assert page.app("document.querySelectorAll('#state b, img').length") == 0
-    assert page.app("app.frames") > 0 and page.problems == []
+    page.wait("app.frames > 0")
+    assert page.problems == []
 
 
 def test_flat_pages_share_what_a_mouse_places(chromium: Browser, room: HeadsetRoom) -> None:
@@ -94,7 +95,8 @@ def test_a_lost_server_comes_back_and_nothing_is_lost(chromium: Browser, room: H
     room._handle = answer
     page.wait("app.connection.text.includes('trying again')")
     page.wait("app.connection.isConnected && !app.connection.isPending(77)")
-    assert room.objects[77]["position"] == [1, 2, 3] and len(room.of_type("cancel")) == 1
+    assert room.objects[77]["position"] == [1, 2, 3]
+    assert len({one["command"] for one in room.of_type("cancel")}) == 1  # the first may have arrived
     page.open(room.url)  # loaded again: goes on with its session
     page.wait("app.connection.isConnected && app.wearer === 'ann' && app.room.objects.has(77)")
     room._names.clear()  # the server knows it no longer

@@ -79,6 +79,17 @@ def test_gaps_and_jumps_of_the_tracker_do_no_harm(drive: MountingDrive) -> None:
 
 
 @pytest.mark.long
+def test_the_sigma_knows_that_the_cameras_scale_may_be_off(drive: MountingDrive) -> None:
+    """By 3 %, which moves x by 2.7 mm; what the windows show is a tenth of that."""
+    poses = drive.T_odom_body.copy()
+    poses[:, :3, 3] *= 1.03
+    found = find_mounting(replace(drive, T_odom_body=poses))
+    x, y, _ = error(found.T_base_body)
+    assert 0.002 < abs(x) < 2 * found.sigma_x_m and abs(y) < 2.5 * found.sigma_y_m
+    assert found.sigma_x_m < 0.005 and found.scale == pytest.approx(0.03, abs=0.015)
+
+
+@pytest.mark.long
 def test_another_robots_wheels_are_refused(drive: MountingDrive) -> None:
     with pytest.raises(DataError, match=r"of the way|known to"):
         find_mounting(replace(drive, wheels=drive.wheels * (0.6, 0.6, 1.0)))

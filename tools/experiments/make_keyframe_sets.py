@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--motion", action="append", required=True, metavar="[NAME=]SPEC", help="may be repeated"
     )
-    made.add_argument("--seeds", type=_seeds, default=range(1), metavar="FIRST:END", help="END is left out")
+    made.add_argument("--seeds", type=seeds_of, default=range(1), metavar="FIRST:END", help="END is left out")
     made.add_argument("--seconds", type=float, default=40.0)
     made.add_argument("--size", type=_size, metavar="LxWxH", help="m (default: the scene's)")
     made.add_argument("--profile", metavar="PROFILE[:MODE]", help="(default: d435i)")
@@ -89,7 +89,7 @@ def line(made: KeyframeSet) -> str:
     return f"{made.recipe.scene} {made.recipe.seed}:  {counts}"
 
 
-def _seeds(text: str) -> range:
+def seeds_of(text: str) -> range:
     found = re.fullmatch(r"(\d+):(\d+)", text)
     if not found or int(found[1]) >= int(found[2]):
         raise argparse.ArgumentTypeError(f"'{text}' is not FIRST:END, such as 0:200")

@@ -110,8 +110,9 @@ def track_session(
     inertial: InertialConfig,
     sequencer: SequencerConfig,
     error_source: str,
+    names: tuple[str, ...] | None = None,
 ) -> dict[str, tuple[Rig, list[TrackedFrame]]]:
-    """Return rig and tracked frames of each agent, by name; `arrival_ns` is in the session's clock.
+    """Return rig and tracked frames of each agent, or of those named; `arrival_ns` is in the session's clock.
 
     `error_source`: where tracking errors come from: "truth", the file of an error model, or "" for none.
     """
@@ -120,6 +121,7 @@ def track_session(
     return {
         name: track_agent(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns, error_source)
         for name, agent in session.agents.items()
+        if names is None or name in names
     }
 
 

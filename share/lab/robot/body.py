@@ -31,32 +31,35 @@ class BodyPath:
         count = int(seconds / STEP_S) + 100
         self._rumble = np.stack([rumble_displacement(count, rng) for _ in range(4)])
         self._points = np.empty((count, 7))  # position, quaternion
-        self._count = 0
+        self._count = 0  # of points
+        self._added: list[DriveStep] = []  # of which there are no points yet: they are made together
 
     def add(self, step: DriveStep) -> None:
         """Add the base after its next step; first at time 0, before which it is at rest."""
-        for _ in range(1 if self._count else 1 + _BEFORE):
-            self._append(step)
+        is_first = not self._count and not self._added
+        self._added += [step] * (1 + _BEFORE if is_first else 1)
 
-    def _append(self, step: DriveStep) -> None:
-        k = self._count
-        speed = np.array([step.speed_m_s])
-        up, aside, pitch, roll = base_shake(speed, _VIBRATION_M_S2, self._rumble[:, k : k + 1])
-        nose = pitch + PITCH_PER_ACCEL * np.clip(step.acceleration_m_s2, -2.0, 2.0)
-        T = step.T_world_base
-        R = axis_rotation(2, np.array([T.yaw])) @ axis_rotation(1, -nose) @ axis_rotation(0, roll)
-        p = np.array([T.x, T.y, 0.0]) + R[0] @ np.array([0.0, aside[0], up[0]])
-        T_world_body = se3.from_rt(R[0], p) @ self._T_base_body
-        self._points[k] = *T_world_body[:3, 3], *se3.quat_from_matrix(T_world_body[:3, :3])
-        self._points[max(k - 1, 0) : k + 1, 3:] = continuous_quaternions(
-            self._points[max(k - 1, 0) : k + 1, 3:]
-        )
-        self._count += 1
+    def _make_points(self) -> None:
+        first, last = self._count, self._count + len(self._added)
+        poses = [step.T_world_base for step in self._added]
+        x, y, yaw = np.array([(T.x, T.y, T.yaw) for T in poses]).T
+        speed, acceleration = np.array([(s.speed_m_s, s.acceleration_m_s2) for s in self._added]).T
+        up, aside, pitch, roll = base_shake(speed, _VIBRATION_M_S2, self._rumble[:, first:last])
+        nose = pitch + PITCH_PER_ACCEL * np.clip(acceleration, -2.0, 2.0)
+        R = axis_rotation(2, yaw) @ axis_rotation(1, -nose) @ axis_rotation(0, roll)
+        shaken = np.stack([np.zeros_like(up), aside, up], axis=1)
+        p = np.stack([x, y, np.zeros_like(x)], axis=1) + np.einsum("nij,nj->ni", R, shaken)
+        T_world_body = se3.from_rt(R, p) @ self._T_base_body
+        self._points[first:last, :3] = T_world_body[:, :3, 3]
+        self._points[first:last, 3:] = se3.quat_from_matrix(T_world_body[:, :3, :3])
+        signed = continuous_quaternions(self._points[max(first - 1, 0) : last, 3:])
+        self._points[first:last, 3:] = signed[-len(self._added) :]
+        self._count, self._added = last, []
 
     @property
     def known_until_ns(self) -> int:
         """Session time until which the path is known."""
-        return (self._count - 1 - _BEFORE) * STEP_NS - LOOK_AHEAD_NS
+        return (self._count + len(self._added) - 1 - _BEFORE) * STEP_NS - LOOK_AHEAD_NS
 
     def part(self, first_ns: int, last_ns: int) -> SplinePath:
         """Return the path from one session time to another, or a little more. Raises ValueError where it is
@@ -65,6 +68,8 @@ class BodyPath:
             raise ValueError(f"{first_ns} .. {last_ns} ns: the path is known until {self.known_until_ns} ns")
         from scipy.interpolate import BSpline
 
+        if self._added:
+            self._make_points()
         # control point k is the middle of its B-spline, which spans three steps to both sides
         first, last = first_ns // STEP_NS, last_ns // STEP_NS + 6
         points = self._points[first : last + 1]

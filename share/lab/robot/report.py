@@ -44,8 +44,8 @@ def run_report(run: LoopRun, session: str) -> dict[str, Any]:
         "reached_m": REACHED_M,
         "reached": sum(one.is_reached for one in outcomes),
         "ended": sum(one.has_ended for one in outcomes),
-        "goals": [_goal(outcome) for outcome in outcomes],
-        "first_goals": [_goal(outcome) for outcome in run.giver.first_goals],
+        "goals": [goal_report(outcome) for outcome in outcomes],
+        "first_goals": [goal_report(outcome) for outcome in run.giver.first_goals],
         "place_error_m": None if not errors else round(median(errors), _DIGITS),
         "place_error_p95_m": None if not errors else round(float(np.percentile(errors, 95)), _DIGITS),
         "bumps": loop.base.bumps,
@@ -54,7 +54,8 @@ def run_report(run: LoopRun, session: str) -> dict[str, Any]:
     }
 
 
-def _goal(outcome: GoalOutcome) -> dict[str, Any]:
+def goal_report(outcome: GoalOutcome) -> dict[str, Any]:
+    """Return what became of a goal as plain data."""
     return {
         "goal": _pose(outcome.T_world_goal),
         "in_map": None if outcome.in_map is None else _pose(outcome.in_map),

@@ -46,12 +46,11 @@ class EmulatedRoom:
         return np.array(at, np.float64).reshape(-1, 2)
 
 
-def open_room(session: Session, progress: Progress) -> EmulatedRoom:
-    """Return the room of a session, made again and kept in the user's cache. Raises UsageError for a session
-    from elsewhere."""
-    recipe = _recipe(session)
+def open_room(recipe: SessionRecipe, progress: Progress, has_pictures: bool = True) -> EmulatedRoom:
+    """Return the room of a session, made again. has_pictures: kept in the user's cache, to be drawn."""
     prepared = prepare_session(recipe, default_cache() / f"room-{recipe.digest}", progress)
-    keep_room(prepared, progress)
+    if has_pictures:
+        keep_room(prepared, progress)
     actors = prepared.stage.actors
     return EmulatedRoom(
         recipe,
@@ -62,7 +61,8 @@ def open_room(session: Session, progress: Progress) -> EmulatedRoom:
     )
 
 
-def _recipe(session: Session) -> SessionRecipe:
+def session_recipe(session: Session) -> SessionRecipe:
+    """Return the recipe that a session was made by. Raises UsageError for a session from elsewhere."""
     made = session.provenance
     if made.get("generator") != "share emulate":
         raise UsageError(

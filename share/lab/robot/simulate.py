@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,11 +13,12 @@ import numpy as np
 from share.config import Config
 from share.errors import UsageError
 from share.geometry.se3 import inverse
+from share.lab.emulate.recipe import Progress
 from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.types import START_NS
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS
 from share.lab.evaluate.simulation import TrackedFrame
-from share.lab.evaluate.virtual_time import track_agent, tracked_frame
+from share.lab.evaluate.virtual_time import track_session, tracked_frame
 from share.lab.robot.base import RobotBase
 from share.lab.robot.drive import DriveModel
 from share.lab.robot.faults import LoopFault, schedule_faults
@@ -34,7 +35,6 @@ from share.robot.settings import RobotSettings
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate, SynchronousErrorModel
 from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.runtime.offline_tracking import track_frames
-from share.runtime.source import open_source
 from share.sensors.profile import load_profile
 from share.types import AgentKind
 from share.wire.messages import Hello
@@ -46,8 +46,6 @@ _ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
 _FRAME_HZ = 15.0  # of a robot that knows its true place
 _STEP_S = 0.5
 _CAMERA_M = (0.09, 0.018, 0.21)
-
-Show = Callable[[str, float], None]  # what goes on, session time s
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +102,7 @@ class EmulatedRobotAgent:
 
 @dataclass(frozen=True, eq=False)
 class LoopRun:
-    """A finished run. giver: with the goals' outcomes."""
+    """A run, before or after its drive. giver: with the goals' outcomes."""
 
     options: LoopOptions
     loop: RobotLoop
@@ -114,35 +112,39 @@ class LoopRun:
     def outcomes(self) -> list[GoalOutcome]:
         return self.giver.outcomes
 
+    def drive(self) -> Iterator[float]:
+        """Go on, and yield the session time, s, every so often, until all goals have their end or the run
+        has."""
+        now_s = 0.0
+        while now_s < self.options.seconds and not self.giver.is_done:
+            now_s += _STEP_S
+            self.loop.run(now_s)
+            yield now_s
 
-def simulate(
-    session: Session,
+
+def prepare_run(
+    session: Session | None,
     room: EmulatedRoom,
     options: LoopOptions,
     config: Config,
     robot: RobotSettings,
-    show: Show,
+    progress: Progress,
 ) -> LoopRun:
-    """Send a robot about in a session's room. Deterministic for given options. Raises UsageError."""
-    loop, giver = prepare_loop(session, room, options, config, robot, show)
+    """Return a robot that is to be sent about in a session's room. session: None without pictures, where the
+    robot does not see. Deterministic for given options. Raises UsageError."""
+    loop, giver = _loop(session, room, options, config, robot, progress)
     schedule_faults(loop, options.faults)
-    now_s = 0.0
-    while now_s < options.seconds and not giver.is_done:
-        now_s += _STEP_S
-        loop.run(now_s)
-        show("driving", now_s)
     return LoopRun(options, loop, giver)
 
 
-def prepare_loop(
-    session: Session,
+def _loop(
+    session: Session | None,
     room: EmulatedRoom,
     options: LoopOptions,
     config: Config,
     robot: RobotSettings,
-    show: Show,
+    progress: Progress,
 ) -> tuple[RobotLoop, GoalGiver]:
-    """Return the loop before its start, and who gives the goals."""
     rngs = [np.random.default_rng((options.seed, stream)) for stream in range(4)]
     T_world_base = start_pose(room.grid, room.people_at(0), rngs[0])
     T_base_body = inverse(robot.T_body_base)
@@ -156,7 +158,9 @@ def prepare_loop(
         own_pose = _own_pose(base, options.localisation)
         loop = RobotLoop(config, [], *common, None, network, own_pose, times)
         return loop, GoalGiver(loop, draw, count, points_in_room)
-    members = _people(session, room, config, show)
+    if session is None:
+        raise ValueError("a robot that sees needs the session's recordings")
+    members = _people(session, room, config, progress)
     sensors = _robot_sensors(room, base, options)
     agent = EmulatedRobotAgent(sensors, config, _ROBOT_RUN, lambda text: loop.note(f"agent: {text}"))
     loop = RobotLoop(config, members, *common, agent, network)
@@ -195,16 +199,21 @@ def _goal_source(
     return lambda here: next(given), len(options.goals)
 
 
-def _people(session: Session, room: EmulatedRoom, config: Config, show: Show) -> list[Member]:
-    """Return the session's headsets, tracked from their files."""
+def _people(session: Session, room: EmulatedRoom, config: Config, progress: Progress) -> list[Member]:
+    """Return the session's headsets, tracked from their files; once where runs follow each other."""
+    if not room.people:
+        return []
+    names = tuple(person.name for person in room.people)
+    progress(f"tracking {', '.join(names)}", 0, 1)
+    settings = config.tracker, config.inertial, config.sequencer
+    tracked = track_session(session.folder.resolve(), *settings, config.agent.error_model, names)
     members: list[Member] = []
     for number, person in enumerate(room.people, 1):
-        show(f"tracking {person.name}", 0.0)
-        source = open_source(f"{session.folder}/{person.name}")
-        offset_ns = session.agents[person.name].clock_offset_ns + START_NS
-        rig, frames = track_agent(source, config, offset_ns, config.agent.error_model)
+        rig, frames = tracked[person.name]
         hello = Hello(person.name, person.kind, number, rig)
-        members.append((hello, iter(frames), NETWORK_PRESETS[LINK]))
+        arriving = (replace(one, arrival_ns=one.arrival_ns - START_NS) for one in frames)
+        members.append((hello, arriving, NETWORK_PRESETS[LINK]))
+    progress(f"tracking {', '.join(names)}", 1, 1)
     return members
 
 

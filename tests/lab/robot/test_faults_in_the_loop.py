@@ -88,6 +88,17 @@ def test_three_seconds_without_network_do_not_stop_the_robot() -> None:
     arrives(alone("network", seconds=3.0))
 
 
+def test_three_seconds_without_network_do_not_stop_a_robot_in_a_shared_map() -> None:
+    """It is where its odometry says in the map that it had, and that is what the wearer meant."""
+    drive = Drive([PlanarPose(6.0, 4.0, 1.0)], settings=SLOW, seconds=90.0)
+    drive.run_until(lambda: bool(drive.giver.outcomes) and drive.speed_m_s > 0.1, 40.0)
+    assert str(drive.giver.outcomes[0].map_id).startswith("ann-")
+    schedule_faults(drive.loop, [LoopFault("network", 0.0, 3.0)])
+    drive.run(90.0)
+    [outcome] = drive.giver.outcomes
+    assert outcome.is_reached and outcome.attempts == 1, drive.texts
+
+
 def test_an_agent_that_is_killed_stops_the_robot() -> None:
     drive = alone("agent", seconds=60.0)
     stops(drive, "no pose for 0.5 s", within_s=1.0)
@@ -134,6 +145,15 @@ def test_a_goal_outside_the_area_is_refused_and_nothing_moves() -> None:
     drive = Drive([GOAL], settings=replace(SLOW, area=DrivingArea(corners)), has_ann=False)
     drive.loop.run(3.0)
     assert any("is outside the area" in text and "refused" in text for text in drive.texts)
+    assert drive.base.driven_m(0, drive.loop.now_ns) < 1e-6
+
+
+def test_a_goal_outside_the_map_is_given_up_and_nothing_moves() -> None:
+    """Without an area the bridge passes it on, and navigation finds no way."""
+    drive = Drive([PlanarPose(30.0, 3.0, 0.5)], settings=SLOW, has_ann=False)
+    drive.run(30.0)
+    [outcome] = drive.giver.outcomes
+    assert outcome.text == "the robot gave up (Nav2's error 203)" and not outcome.says_reached
     assert drive.base.driven_m(0, drive.loop.now_ns) < 1e-6
 
 
