@@ -19,7 +19,6 @@ from share.types import F64
 
 FREE_SQUARE_M = 40.0  # the map, where neither an area nor a map is given
 _KEYS = ("camera", "T_base_body", "area", "area_map", "map", "max_speed_m_s", "max_sigma_m", "edge_silence_s")
-_MOUNTING_KEYS = ("camera:", "T_base_body:")
 # a camera's body (x right, y down, z ahead) in a base (x ahead, y left, z up), both level and looking ahead
 _R_BASE_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -50,17 +49,6 @@ def read_robot(path: Path) -> RobotDescription:
     if "map" in form:
         return RobotDescription(settings, read_grid(path.parent / form.text("map")))
     return RobotDescription(settings) if area is None else RobotDescription(settings, area_grid(area))
-
-
-def with_mounting(text: str, T_base_body: F64) -> str:
-    """Return the text of a robot file with another mounting; the old one stays as a comment."""
-    lines, is_old = [], False
-    for line in text.splitlines():
-        if line[:1].strip():  # a key, or a comment, at the left edge
-            is_old = line.startswith(_MOUNTING_KEYS)
-        lines.append(f"# {line}" if is_old and line.strip() else line)
-    rows = [f"  - [{', '.join(f'{value:.6f}' for value in row)}]" for row in T_base_body]
-    return "\n".join([*lines, "T_base_body:  # by share robot calibrate", *rows, ""])
 
 
 def _T_base_body(form: Section) -> F64:
