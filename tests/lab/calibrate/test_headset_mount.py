@@ -40,12 +40,18 @@ def tracked(rng: np.random.Generator, T: np.ndarray, hz: float) -> np.ndarray:
     return se3.exp(rng.normal(size=6)) @ out @ se3.exp(tremble)
 
 
-def two_trackers(seed: int, roll_pitch_yaw=(0.5, 0.5, 0.9), loose_rad: float = 0.0, seconds: float = SECONDS):
+def two_trackers(
+    seed: int,
+    roll_pitch_yaw=(0.5, 0.5, 0.9),
+    loose_rad: float = 0.0,
+    seconds: float = SECONDS,
+    loose_m: float = 0.0,
+):
     """Return a device's and a headset's poses, and the offset of their clocks, s."""
     rng = np.random.default_rng(seed)
     t_device, t_headset = np.arange(0, seconds, 1 / 30), np.arange(-1, seconds + 1, 1 / 72)
     viewer_of_device, viewer = head_poses(rng, roll_pitch_yaw, t_device, t_headset)
-    turned = np.where(t_device[:, None] > seconds / 2, [[loose_rad, 0, 0, 0, 0, 0]], 0.0)
+    turned = np.where(t_device[:, None] > seconds / 2, [[loose_rad, 0, 0, 0, loose_m, 0]], 0.0)
     body = viewer_of_device @ se3.inverse(T_body_viewer @ se3.exp(turned))
     offset_s, start = rng.uniform(-0.4, 0.4), 10**12
     device = MocapTrajectory((t_device * 1e9).astype(np.int64) + start, tracked(rng, body, 30), "device")
@@ -82,6 +88,13 @@ def test_a_mount_that_slips_by_a_degree_is_said():
     device, headset, _ = two_trackers(4, loose_rad=np.radians(1))
     warning = moved_warning(device, headset, fit_mount(device, headset))
     assert warning is not None and "the mount moved by 1.0 deg" in warning
+
+
+@pytest.mark.parametrize("seed", [61, 62, 63])
+def test_a_mount_that_slips_by_8_mm_is_said(seed):
+    device, headset, _ = two_trackers(seed, loose_m=0.008)
+    warning = moved_warning(device, headset, fit_mount(device, headset))
+    assert warning is not None and "the mount moved by 0." in warning
 
 
 def test_too_short_and_of_two_heads_is_refused():
