@@ -95,13 +95,15 @@ def checked_mapping(data: Any, where: str) -> dict[Any, Any]:
 
 
 def parse_numbers(values: Sequence[Any], where: str) -> list[float]:
-    """Return finite numbers, which may be given as text. Raises ConfigError."""
+    """Return numbers within ±MAX_NUMBER, which may be given as text. Raises ConfigError."""
     try:
         numbers = [float(value) for value in values]  # PyYAML reads 1e-3 as text
     except (TypeError, ValueError, OverflowError):
         raise ConfigError(f"{where}: expected numbers, found {values}") from None
     if not np.isfinite(numbers).all():
         raise ConfigError(f"{where}: has values that are not finite: {values}")
+    if max(map(abs, numbers), default=0.0) > MAX_NUMBER:
+        raise ConfigError(f"{where}: has values beyond {MAX_NUMBER:g}: {values}")
     return numbers
 
 

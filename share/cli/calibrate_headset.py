@@ -50,11 +50,16 @@ def headset(device: Path, headset: Path, out: Path, as_json: bool) -> None:
 
 def _poses(path: Path) -> MocapTrajectory:
     from share.lab.mocap.trajectory import MocapTrajectory
+    from share.recordings.losses import DataLosses
     from share.recordings.trajectory import read_tum
 
-    if not path.is_file():
+    if not path.exists():
         raise UsageError(f"{path}: no such file")
-    return MocapTrajectory(*read_tum(path), source=str(path))
+    losses = DataLosses()
+    stamps_ns, T = read_tum(path, losses)
+    for line in losses.lines():
+        print_note(str(path), line)
+    return MocapTrajectory(stamps_ns, T, source=str(path))
 
 
 def _summary(mount: HeadsetMount) -> str:

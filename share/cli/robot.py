@@ -252,12 +252,14 @@ def calibrate(
     """
     from contextlib import ExitStack, closing
 
+    from share.errors import ShareError
     from share.files.writing import atomic_write
     from share.files.yaml_file import read_yaml_text
     from share.geometry.se3 import inverse
     from share.net.udp import StampedSocket
     from share.robot.mounting import find_mounting
-    from share.robot.robot_file import read_robot, with_mounting
+    from share.robot.mounting_text import mounting_line, with_mounting
+    from share.robot.robot_file import read_robot
     from share.runtime.robot_drive import record_drive
     from share.runtime.signals import stop_on_signal
 
@@ -271,9 +273,15 @@ def calibrate(
         drive = record_drive(link, node, agent, seconds, lambda: bool(ended), live.write)
     live.end()
     found = find_mounting(drive, float(before[2, 3]))
-    text = with_mounting(read_yaml_text(robot_file), found.T_base_body)
-    atomic_write(robot_file, text)
-    click.echo(json.dumps(found.report()) if as_json else f"{found.text()}\nwritten to {robot_file}")
+    try:
+        written = with_mounting(read_yaml_text(robot_file), found.T_base_body, str(robot_file))
+        atomic_write(robot_file, written.text)
+    except ShareError as error:  # the drive is not lost
+        raise type(error)(f"{error}; found, to put in by hand: {mounting_line(found.T_base_body)}") from None
+    said = f"written to {robot_file}"
+    if written.is_rewritten:
+        said += " in another form; the old text is in it as comments"
+    click.echo(json.dumps(found.report()) if as_json else f"{found.text()}\n{said}")
 
 
 @robot.command(short_help="Print the node that runs on a robot, for `bridge --node`.")

@@ -109,7 +109,7 @@ def draw_room(
 ) -> None:
     """Draw the room and a line below over what was drawn before. Raises ShareError as `room_lines`."""
     lines = room_lines(picture, report, plan)
-    live.write_block([*lines, below[: shutil.get_terminal_size().columns - 1]])
+    live.write_block([*lines, printable(below[: shutil.get_terminal_size().columns - 1])])
 
 
 def room_lines(

@@ -66,13 +66,22 @@ def read_yaml_text(path: Path) -> str:
 def read_yaml(path: Path) -> Section:
     """Read the top mapping of a YAML file, including OpenCV's (`%YAML:1.0`, `!!opencv-matrix`). Raises
     ConfigError."""
+    return parse_yaml(read_yaml_text(path), str(path))
+
+
+def parse_yaml(text: str, where: str) -> Section:
+    """Return the top mapping of the text of a YAML file. Raises ConfigError."""
     from share.strict_yaml import load_yaml
 
-    text = read_yaml_text(path)
+    return Section(load_yaml(without_opencv(text), where), where)
+
+
+def without_opencv(text: str) -> str:
+    """Return YAML of OpenCV without what is none, line by line."""
     lines = text.replace("!!opencv-matrix", "").split("\n")
     if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
         lines[0] = ""
-    return Section(load_yaml("\n".join(lines), str(path)), str(path))
+    return "\n".join(lines)
 
 
 def read_settings(path: Path) -> Config:

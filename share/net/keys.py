@@ -200,17 +200,20 @@ def load_pair(folder: Path) -> KeyPair:
 
 
 def public_key(key_or_path: str) -> str:
-    """Return the public key in the file `key_or_path`, or `key_or_path` itself if it is a key. Raises
-    UsageError."""
-    if re.fullmatch(_Z85, key_or_path) and _is_key(key_or_path):
-        return key_or_path
+    """Return the public key in the file `key_or_path`, or `key_or_path` itself if it is a key and no path.
+    Raises UsageError."""
+    if os.path.isfile(key_or_path):  # first: 40 characters of a path can be a key's too
+        return _parse_line(_read_text(Path(key_or_path)), key_or_path)[0]
     if key_or_path.startswith("share-"):
         return _parse_line(key_or_path, "the given key")[0]
-    if not os.path.isfile(key_or_path):
+    if not re.fullmatch(_Z85, key_or_path) or not _is_key(key_or_path):
         raise UsageError(
             f"'{key_or_path:.60}': neither a file nor a public key (40 characters, in single quotes)"
         )
-    return _parse_line(_read_text(Path(key_or_path)), key_or_path)[0]
+    folder = os.path.dirname(key_or_path)
+    if key_or_path.endswith(".public") or (len(folder) > 1 and os.path.isdir(folder)):  # by chance: never
+        raise UsageError(f"'{key_or_path}': no such file")
+    return key_or_path
 
 
 def allow_list(folder: Path) -> AllowList:

@@ -116,6 +116,8 @@ def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
     yaw, x, y, scale = fits[0]
     spread = fits[1:] - fits[1:].mean(0)
     sigma = np.sqrt((len(spread) - 1) / len(spread) * (spread**2).sum(0))  # the jackknife's
+    if not (np.isfinite(fits).all() and np.isfinite(sigma).all()):
+        raise DataError("no mounting fits this drive, whose odometry has values of no robot; drive again")
     if abs(scale) > _MAX_SCALE:
         raise DataError(
             f"camera and wheels differ by {100 * abs(scale):.0f} % of the way: are both this robot's, "

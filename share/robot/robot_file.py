@@ -17,9 +17,9 @@ from share.robot.grid import FloorMap, area_grid, free_rectangle, read_grid
 from share.robot.settings import CREATE3_SPEED_M_S, DrivingArea, RobotSettings
 from share.types import F64
 
+_MAX_MOUNTING_M = 10.0  # of the camera from base_link; a position in mm is beyond
 FREE_SQUARE_M = 40.0  # the map, where neither an area nor a map is given
 _KEYS = ("camera", "T_base_body", "area", "area_map", "map", "max_speed_m_s", "max_sigma_m", "edge_silence_s")
-_MOUNTING_KEYS = ("camera:", "T_base_body:")
 # a camera's body (x right, y down, z ahead) in a base (x ahead, y left, z up), both level and looking ahead
 _R_BASE_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -38,7 +38,12 @@ def read_robot(path: Path) -> RobotDescription:
     if unknown := [key for key in form.data if key not in _KEYS]:
         raise ConfigError(f"{path}: unknown key '{unknown[0]}'; known: {', '.join(_KEYS)}")
     area = _area(form) if "area" in form else None
-    settings = RobotSettings(inverse(_T_base_body(form)), area=area)
+    T_base_body = _T_base_body(form)
+    if np.abs(T_base_body[:3, 3]).max() > _MAX_MOUNTING_M:
+        raise ConfigError(
+            f"{path}: the camera is more than {_MAX_MOUNTING_M:g} m from base_link; give metres"
+        )
+    settings = RobotSettings(inverse(T_base_body), area=area)
     settings = replace(
         settings,
         max_speed_m_s=form.number("max_speed_m_s", settings.max_speed_m_s, positive=True),
@@ -50,17 +55,6 @@ def read_robot(path: Path) -> RobotDescription:
     if "map" in form:
         return RobotDescription(settings, read_grid(path.parent / form.text("map")))
     return RobotDescription(settings) if area is None else RobotDescription(settings, area_grid(area))
-
-
-def with_mounting(text: str, T_base_body: F64) -> str:
-    """Return the text of a robot file with another mounting; the old one stays as a comment."""
-    lines, is_old = [], False
-    for line in text.splitlines():
-        if line[:1].strip():  # a key, or a comment, at the left edge
-            is_old = line.startswith(_MOUNTING_KEYS)
-        lines.append(f"# {line}" if is_old and line.strip() else line)
-    rows = [f"  - [{', '.join(f'{value:.6f}' for value in row)}]" for row in T_base_body]
-    return "\n".join([*lines, "T_base_body:  # by share robot calibrate", *rows, ""])
 
 
 def _T_base_body(form: Section) -> F64:

@@ -110,7 +110,7 @@ class PoseMessages:
             "edge": is_connected,
         }
         self._sequence += 1
-        return json.dumps(message, separators=(",", ":"))
+        return json.dumps(message, separators=(",", ":"), ensure_ascii=False)  # \u is six bytes a letter
 
 
 def _print_error(text: str) -> None:

@@ -16,6 +16,7 @@ from share.errors import StoreError, UsageError, WireError
 from share.mapping.keyframe_removal import reconnect
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveLink, SavePoses, StoredKeyframe, StoredMap, odometry_link
+from share.protocol.room_objects import MAX_OBJECTS
 from share.store import database, rows, schema
 from share.store.conversion import convert
 from share.store.database import DamageError, translate_errors
@@ -32,6 +33,7 @@ from share.types import Keyframe
 
 _RECONNECTED = "keyframes lost their predecessor and are linked to an earlier one"
 _ABOUT_LOST = "rows about the file and the credentials of runs could not be read"
+_OBJECTS_LEFT_OUT = f"objects of the room are too many ({MAX_OBJECTS} at most) and stay in the file unused"
 _SOLUTIONS_LOST = "solutions could not be read: keyframes are placed by odometry and loops"
 
 
@@ -169,6 +171,9 @@ def _outline(read_rows: ReadRows) -> StoredMap:
     chosen = {runs[keyframe.run_key].run_key: keyframe for keyframe in keyframes}  # KeyError without its run
     links = [rows.read_link(row) for row in tables["link"] if row[0] in chosen and row[:2] not in posed]
     next_ids = {row[0]: row[1] for row in tables["run"]}
+    objects, lost_objects = rows.read_objects(read_rows.tables["about"])
+    if lost_objects or len(objects) > MAX_OBJECTS:
+        raise ValueError("objects")
     return StoredMap(
         tuple(replace(run, credential=credentials.get(key, "")) for key, run in runs.items()),
         (),
@@ -177,7 +182,7 @@ def _outline(read_rows: ReadRows) -> StoredMap:
         tuple(rows.read_loop(row) for row in tables["loop"]),
         solved,
         {key: max(next_ids[key], newest.get(key, -1) + 1) for key in runs},
-        objects=rows.read_objects(read_rows.tables["about"]),
+        objects=objects,
     )
 
 
@@ -200,6 +205,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     known_keys = {k.keyframe_key for k in repaired.keyframes}
     connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)
     segments, lost_segments = _decode_rows(read_rows, "stretch", rows.read_segment)
+    objects, lost_objects = rows.read_objects(read_rows.tables["about"])
     complaints = [
         _loss_line(read_rows, "about", read_rows.lost_counts["about"], _ABOUT_LOST),
         _loss_line(read_rows, "run", lost_runs, "agent runs could not be read"),
@@ -211,6 +217,8 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _loss_line(read_rows, "", len(loops) - len(connected_loops), "loops led to lost keyframes"),
         _loss_line(read_rows, "stretch", lost_segments, "segments could not be read"),
         _loss_line(read_rows, "poses", lost_poses, _SOLUTIONS_LOST),
+        _loss_line(read_rows, "", lost_objects, "objects of the room could not be read"),
+        _loss_line(read_rows, "", max(0, len(objects) - MAX_OBJECTS), _OBJECTS_LEFT_OUT),
     ]
     return StoredMap(
         tuple(runs.values()),
@@ -221,7 +229,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _present_poses(poses[0], known_keys) if poses else None,
         _next_ids(next_ids, repaired.keyframes),
         tuple(line for line in complaints if line),
-        rows.read_objects(read_rows.tables["about"]),
+        objects,
     )
 
 

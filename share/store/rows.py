@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import sqlite3
 import zlib
@@ -176,17 +175,25 @@ class _ObjectFields(msgspec.Struct):
     T: list[list[float]]
 
 
-def read_objects(about: list[tuple[int, Row]]) -> tuple[SaveObject, ...]:
-    """Return the objects of the room, from the rows of `about`; one that cannot be read is left out."""
-    out = []
+def read_objects(about: list[tuple[int, Row]]) -> tuple[tuple[SaveObject, ...], int]:
+    """Return the objects of the room, from the rows of `about`, and the number of unreadable ones."""
+    out, lost_count = [], 0
     for _, (name, value) in about:
-        if isinstance(name, str) and isinstance(value, str) and name.startswith(_OBJECT_PREFIX):
-            with contextlib.suppress(ValueError, msgspec.MsgspecError):
-                fields = msgspec.json.decode(value, type=_ObjectFields)
-                object_id, T = int(name.removeprefix(_OBJECT_PREFIX)), np.array(fields.T, np.float64)
-                one = RoomObject(0, 0, object_id, fields.kind, fields.owner, fields.map, T)
-                out.append(SaveObject(one, checked_map_id(fields.home)))
-    return tuple(out)
+        if isinstance(name, str) and name.startswith(_OBJECT_PREFIX):
+            try:
+                out.append(_read_object(name, _checked_text(value)))
+            except (ValueError, msgspec.MsgspecError):
+                lost_count += 1
+    return tuple(out), lost_count
+
+
+def _read_object(name: str, value: str) -> SaveObject:
+    fields = msgspec.json.decode(value, type=_ObjectFields)
+    object_id, T = int(name.removeprefix(_OBJECT_PREFIX)), np.array(fields.T, np.float64)
+    if object_name(object_id) != name:  # 007, which is not where object 7 is written
+        raise ValueError(f"{name!r} is no object's name")
+    one = RoomObject(0, 0, object_id, fields.kind, fields.owner, fields.map, T)
+    return SaveObject(one, checked_map_id(fields.home))
 
 
 def read_keyframe(row: Row) -> StoredKeyframe:

@@ -140,7 +140,7 @@ def _write_rows(read_rows: ReadRows, part: Path) -> None:
         for run, credential in rows.read_credentials(read_rows.tables["about"]).items():
             if run in known_runs:
                 insert(connection, "about", rows.credential_row(run, credential))
-        for stored in rows.read_objects(read_rows.tables["about"]):
+        for stored in rows.read_objects(read_rows.tables["about"])[0]:
             insert(connection, "about", rows.object_row(stored))
         for statement in _DELETE_ORPHANS:
             connection.execute(statement)

@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from share.colours import Colour, agent_colour
+from share.errors import printable
 from share.protocol.agent_health import LIMITS
 from share.types import AgentKind
 
@@ -25,6 +26,7 @@ _BRAILLE = 0x2800
 _ARROWS = "→↗↑↖←↙↓↘"
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _HISTORY = 16  # poses in a sparkline
+_MAX_STEPS = 100_000  # dots between the ends of all lines of a plan; it has some ten thousand dots
 _BAD: Colour = (229, 72, 77)
 _GOOD: Colour = (48, 164, 108)
 Report = Mapping[str, Any]
@@ -111,7 +113,7 @@ class TerminalPicture:
         for name, one in here.items():
             canvas.draw_agent(name, one, self._colour(name))
         caption = f"map of {', '.join(here) or 'no agent now'}, {canvas.metres_wide:.0f} m wide"
-        return [*canvas.lines(), f"{caption[:width]:{width}}"]
+        return [*canvas.lines(), f"{printable(caption[:width]):{width}}"]
 
 
 def _trouble_line(name: str, agent: Report, columns: int) -> str:
@@ -130,7 +132,7 @@ class _Line:
         self._left, self._parts = columns, list[str]()
 
     def add(self, text: str, colour: Colour | None = None) -> None:
-        text = "".join(c if c.isprintable() else "?" for c in text[: self._left])
+        text = printable(text[: self._left])
         self._left -= len(text)
         self._parts.append(text if colour is None else click.style(text, fg=colour))
 
@@ -151,6 +153,7 @@ class _Canvas:
         self._dots: dict[tuple[int, int], int] = {}  # by row and column
         self._marks: dict[tuple[int, int], str] = {}
         self._colours: dict[tuple[int, int], Colour] = {}
+        self._most_steps = _MAX_STEPS
 
     @property
     def metres_wide(self) -> float:
@@ -158,7 +161,8 @@ class _Canvas:
 
     def draw_path(self, path: Sequence[Sequence[float]], colour: Colour) -> None:
         for (x0, y0), (x1, y1) in pairwise(path):
-            steps = 1 + int(math.hypot(x1 - x0, y1 - y0) / self._m)
+            steps = 1 + min(int(math.hypot(x1 - x0, y1 - y0) / self._m), self._most_steps)
+            self._most_steps -= steps - 1  # where all are spent only the ends are drawn
             for k in range(steps + 1):
                 self._dot(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps, colour)
 

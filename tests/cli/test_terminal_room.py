@@ -6,14 +6,17 @@ import io
 import os
 import sys
 from contextlib import closing
+from typing import Any
 
 import click
 import pytest
 from helpers.terminal_room import PLAN, REPORT, Terminal
 
 from share.cli.terminal import LiveLine
-from share.cli.terminal_room import TerminalRoom, has_room
+from share.cli.terminal_room import TerminalRoom, draw_room, has_room
+from share.cli.watch import _last_line
 from share.runtime.status_server import StatusServer
+from share.view.terminal_picture import TerminalPicture
 
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> Terminal:
@@ -36,6 +39,21 @@ def test_what_the_edge_says_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
             assert text in drawn
     assert room.show("frames: ann 20")  # the edge is gone: what was drawn stays
     assert "ann 20" not in screen.getvalue()
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {"trouble": ["\x1b]0;owned\x07\r\n"]},
+        {"policy": "\x1b]0;owned\x07"},
+        {"merges": {"done": "\x1b]0;owned\x07"}},
+    ],
+)
+def test_no_line_of_the_edge_brings_escapes(monkeypatch: pytest.MonkeyPatch, report: dict[str, Any]) -> None:
+    screen = watched(monkeypatch)
+    draw_room(LiveLine(), TerminalPicture(), REPORT, PLAN, _last_line("http://h:1/", report, 0.0))
+    drawn = screen.getvalue()
+    assert "?]0;owned?" in drawn and "\x1b]" not in drawn and "\x07" not in drawn
 
 
 def test_without_an_edge_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,6 +135,25 @@ def test_a_public_key_is_given_as_text_line_or_file(tmp_path: Path) -> None:
     assert [keys.public_key(one) for one in given] == [pair.public] * 3
 
 
+def test_a_path_of_40_characters_is_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All its characters are a key's too, and most such words decode to 32 bytes."""
+    pair = keys.generate_pair(tmp_path / "home/ann/.config/share/keys", "edge")
+    monkeypatch.chdir(tmp_path)
+    path = "home/ann/.config/share/keys//edge.public"
+    assert len(path) == 40 and keys._is_key(path)
+    assert keys.public_key(path) == pair.public
+    for typo in (path.replace("edge", "ebge"), path.replace("public", "pubkey")):
+        assert keys._is_key(typo)
+        with pytest.raises(UsageError, match="no such file"):
+            keys.public_key(typo)
+
+
+def test_a_key_with_slashes_is_a_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for key_text in ("/" + "a0" * 19 + "b", "ab/cd/" + "e" * 34):
+        assert keys._is_key(key_text) and keys.public_key(key_text) == key_text
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -9,18 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 from helpers.mounting_drive import eight, mounting_drive
 from helpers.robot_drive import SECOND
 
 from share.cli.main import cli
-from share.errors import DataError
+from share.errors import ConfigError, DataError
+from share.files.yaml_file import read_yaml_text
 from share.geometry.se3 import inverse, so3_log
 from share.robot import robot_events as ev
 from share.robot.mounting import MountingDrive, find_mounting
+from share.robot.mounting_text import mounting_line, with_mounting
 from share.robot.planar import PlanarPose
 from share.robot.pose_message import parse_pose_message
-from share.robot.robot_file import T_base_of_camera, read_robot, with_mounting
+from share.robot.robot_file import T_base_of_camera, read_robot
 from share.runtime.pose import Pose
 from share.runtime.pose_feed import PoseMessages
 from share.runtime.robot_drive import DriveRecorder
@@ -104,11 +107,59 @@ def test_the_file_keeps_everything_else(tmp_path: Path) -> None:
         "area: [[0, 0], [2, 0], [2, 1]]\n"
     )
     for _ in range(2):  # and again over its own result
-        file.write_text(with_mounting(file.read_text(), TRUE))
+        file.write_text(with_mounting(file.read_text(), TRUE, "").text)
         settings = read_robot(file).settings
         assert np.allclose(inverse(settings.T_body_base), TRUE, atol=1e-5)
         assert settings.max_speed_m_s == 0.1 and settings.area is not None
     assert "# mine\n# camera:\n#   position_m: [0, 0, 0.2]\n" in file.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "is_rewritten"),
+    [
+        ("camera:\n  position_m: [0, 0, 0.2]\n# by eye\n  yaw_deg: 2\nmax_speed_m_s: 0.1\n", False),
+        ("camera:\n  position_m:\n  - 0\n  - 0\n  - 0.2\nmax_speed_m_s: 0.1\n", False),
+        ("T_base_body:\n- [1,0,0,0]\n- [0,1,0,0]\n- [0,0,1,0]\n- [0,0,0,1]\nmax_speed_m_s: 0.1\n", False),
+        ('"camera": {position_m: [0, 0, 0.2]}\nmax_speed_m_s: 0.1\n', False),
+        ("max_speed_m_s: 0.1\ncamera : {position_m: [0, 0, 0.2]}\n", False),
+        ("  camera: {position_m: [0, 0, 0.2]}\n  max_speed_m_s: 0.1\n", False),
+        ("camera: {position_m: [0, 0, 0.2],\nyaw_deg: 0}\nmax_speed_m_s: 0.1\n", False),
+        ("max_speed_m_s: 0.1\ncamera: {position_m: [0, 0, 0.2]}\n...\n", False),
+        ("max_speed_m_s: 0.1\ncamera:\n  position_m: [0, 0, 0.2]", False),
+        ("%YAML:1.0\n---\ncamera: {position_m: [0, 0, 0.2]}\nmax_speed_m_s: 0.1\n", False),
+        ("camera:\r\n  position_m: [0, 0, 0.2]\r\nmax_speed_m_s: 0.1\r\n", False),
+        ("{camera: {position_m: [0, 0, 0.2]}, max_speed_m_s: 0.1}\n", True),
+        ('{\n  "camera": {"position_m": [0, 0, 0.2]},\n  "max_speed_m_s": 0.1\n}\n', True),
+        ("? camera\n: position_m: &p [0, 0, 0.2]\nmax_speed_m_s: 0.1\n", False),
+        ("<<: {camera: {position_m: [0, 0, 0.2]}}\nmax_speed_m_s: 0.1\n", True),
+    ],
+)
+def test_every_form_of_the_file_is_read_afterwards(tmp_path: Path, text: str, is_rewritten: bool) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(text, newline="")
+    read_robot(file)
+    for is_other_form in (is_rewritten, False):
+        written = with_mounting(read_yaml_text(file), TRUE, "")
+        file.write_text(written.text)
+        settings = read_robot(file).settings
+        assert np.allclose(inverse(settings.T_body_base), TRUE, atol=1e-5) and settings.max_speed_m_s == 0.1
+        assert written.is_rewritten == is_other_form
+    assert all(line.strip() in file.read_text() for line in text.splitlines())
+
+
+def test_a_mounting_that_cannot_be_written_is_told() -> None:
+    with pytest.raises(ConfigError, match="expected keys and values"):
+        with_mounting("- 1\n", TRUE, "robot.yaml")
+    assert np.allclose(yaml.safe_load(mounting_line(TRUE))["T_base_body"], TRUE, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("metres", [1e154, 1e308])
+def test_a_fit_that_is_no_number_is_refused(drive: MountingDrive, metres: float) -> None:
+    wheels = drive.wheels.copy()
+    wheels[600, :2] = metres, -metres
+    with pytest.raises(DataError, match=r"values of no robot|known to"):
+        find_mounting(replace(drive, wheels=wheels))
 
 
 @pytest.mark.long

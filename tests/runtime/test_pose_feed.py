@@ -14,6 +14,7 @@ import pytest
 
 from share.errors import UsageError
 from share.geometry.se3 import exp, from_rt, matrix_from_quat, so3_exp, so3_log
+from share.net.udp import MAX_DATAGRAM_BYTES
 from share.recordings.trajectory import read_tum
 from share.runtime.pose import Pose
 from share.runtime.pose_feed import PoseFeed, fixed_axes_cov, open_pose_sinks
@@ -85,9 +86,17 @@ def test_a_pose_arrives_as_published(app):
     feed.close()
 
 
-def test_the_longest_datagram_fits_one_packet(app):
-    """1472 bytes of a UDP packet on Ethernet."""
-    feed = PoseFeed(where(app), "ä" * 64)
+@pytest.mark.parametrize(
+    ("name", "map_id", "most"),
+    [
+        ("r" * 64, "b" * 96, 1472),  # of a UDP packet on Ethernet
+        ("ä" * 64, "b" * 96, 1472),
+        ("ロ" * 64, "ロ" * 64 + "-" + "1" * 31, 1472),
+        ("𠮷" * 64, "𠮷" * 96, MAX_DATAGRAM_BYTES),
+    ],
+)
+def test_the_longest_datagram_fits(app, name: str, map_id: str, most: int) -> None:
+    feed = PoseFeed(where(app), name)
     T = from_rt(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([-1000.123456789] * 3))
     cov = np.full((6, 6), -1.2345e-10)
     long = (
@@ -95,7 +104,7 @@ def test_the_longest_datagram_fits_one_packet(app):
         TrackState.INERTIAL_ONLY,
         T,
         T,
-        "b" * 96,
+        map_id,
         10**6,
         -1234.567891 * V,
         -V,
@@ -105,7 +114,8 @@ def test_the_longest_datagram_fits_one_packet(app):
         False,
     )
     feed.publish(Pose(*long))
-    assert len(app.recv(4000)) < 1472
+    datagram = app.recv(4000)
+    assert len(datagram) <= most and json.loads(datagram)["agent"] == name
     feed.close()
 
 

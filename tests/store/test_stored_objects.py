@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
+
 import numpy as np
 import pytest
 from helpers.room_bench import at
 
 from share.mapping.map_changes import RemoveStoredObject, SaveObject
 from share.store.map_store import MapStore
+from share.store.rows import insert, object_row
 from share.wire.room_messages import ObjectKind, RoomObject
 
 
@@ -54,3 +58,25 @@ def test_a_damaged_file_keeps_its_objects(path) -> None:
     path.write_bytes(data)
     assert set(read(path)) == {1, 4}
     assert path.with_name("room.sqlite.damaged-1").exists()
+
+
+def test_what_is_no_object_or_one_too_many_is_said(path) -> None:
+    with MapStore.open(path) as store:
+        store.write([stored(k, 1.0) for k in range(10, 72)])  # 64 with the two of before
+        assert store.load().problems == store.outline().problems == ()
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        _, value = object_row(stored(7, 1.0))
+        for name, text in (
+            ("object 007", value),
+            ("object 7x", value),
+            ("object 8", "[]"),
+            ("object 99", value),
+        ):
+            insert(connection, "about", (name, text))
+    with MapStore.open(path) as store:
+        for loaded in (store.load(), store.outline()):
+            assert loaded.problems == (
+                "3 objects of the room could not be read",
+                "1 objects of the room are too many (64 at most) and stay in the file unused",
+            )
+            assert 7 not in {one.object.object_id for one in loaded.objects}

@@ -8,7 +8,7 @@ import click
 import pytest
 
 from share.colours import agent_colour
-from share.view.terminal_picture import TerminalPicture
+from share.view.terminal_picture import _MAX_STEPS, TerminalPicture, _Canvas
 
 COLUMNS, ROWS = 100, 24
 
@@ -70,6 +70,21 @@ def test_maps_that_are_apart_stand_beside_each_other() -> None:
     lines = drawn({"agents": {"ann": agent(), "bob": agent()}}, plan)
     caption = next(line for line in lines if "map of ann" in line)
     assert caption.index("map of bob") >= COLUMNS // 2 - 1
+
+
+def test_a_path_of_long_lines_takes_no_longer_than_one_of_many_points() -> None:
+    """240,000 lines across the plan, as only a liar sends them: without a limit 30 million dots."""
+    steps: list[tuple[float, float]] = []
+    canvas = _Canvas([[0.0, 0.0], [1e5, 1e5]], COLUMNS, ROWS)
+    canvas._dot = lambda x, y, colour: steps.append((x, y))  # type: ignore[method-assign]
+    canvas.draw_path([[0.0, 0.0], [1e5, 1e5]] * 5_000, (0, 0, 0))
+    assert len(steps) <= _MAX_STEPS + 2 * 10_000
+    assert steps[-2:] == [(0.0, 0.0), (1e5, 1e5)]  # the ends are drawn
+
+
+def test_a_caption_has_no_control_characters() -> None:
+    lines = drawn({"agents": {}}, {"agents": {"\x1b]0;owned\x07": place(EAST)}})
+    assert not any(character in line for line in lines for character in "\x1b\x07")
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(40, 12), (72, 18), (100, 24), (200, 60), (72, 8)])

@@ -25,7 +25,7 @@ _MAX_TRANSLATION_RMS = 0.03  # m; likewise 5 mm
 _MIN_DURATION_S = 15.0
 _ITERATIONS = 10
 _DERIVATIVE_NS = 2_000_000  # of the headset's poses by time, from differences
-_MOVED_SIGMAS = 5.0  # of the difference of two halves
+_MOVED_SIGMAS = 5.0  # Mahalanobis distance of two halves; the sigmas are wide (NEES 0.5)
 _MOVED_ROTATION, _MOVED_TRANSLATION = np.radians(0.3), 0.005  # less than that hurts nobody
 
 
@@ -145,7 +145,7 @@ def moved_warning(device: MocapTrajectory, headset: MocapTrajectory, mount: Head
         return None
     moved = se3.log(se3.inverse(early.T_body_viewer) @ late.T_body_viewer)
     rotation, translation = np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])
-    sigmas = np.sqrt(moved @ np.linalg.solve((early.cov + late.cov)[:6, :6], moved) / 6)
+    sigmas = np.sqrt(moved @ np.linalg.solve((early.cov + late.cov)[:6, :6], moved))
     if sigmas < _MOVED_SIGMAS or (rotation < _MOVED_ROTATION and translation < _MOVED_TRANSLATION):
         return None
     return (

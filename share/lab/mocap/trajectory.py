@@ -14,8 +14,10 @@ from share.types import F64, I64, ImuBatch
 
 _GAP_FACTOR = 5  # times the median spacing of samples
 _MAX_IMU_GAP_NS = 100_000_000  # linear interpolation does not hold across longer gaps
+_MAX_SPACING_NS = 750_000_000  # of half the samples; what is slower shows no turn within a second
 _MAX_DURATION_NS = 6 * 3600 * 10**9  # allowed however rarely the body is seen
 _MAX_HIDDEN_FACTOR = 100  # longer recordings: at most this times the time in which it is seen
+_LONGEST_NS = 24 * 3600 * 10**9  # in any case: clocks are found by rotations every 10 ms of all of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +50,15 @@ class MocapTrajectory:
             )
 
     def _check_span(self) -> None:
-        """Raise DataError for stamps with an outlier or a clock step."""
+        """Raise DataError for stamps in another unit, with an outlier or a clock step."""
         t = self.stamps_ns
-        if t[-1] - t[0] <= max(_MAX_DURATION_NS, _MAX_HIDDEN_FACTOR * len(t) * self.spacing_ns):
+        if self.spacing_ns > _MAX_SPACING_NS:
+            raise DataError(
+                f"{self.source}: poses are {self.spacing_ns * 1e-9:,.1f} s apart, {_MAX_SPACING_NS * 1e-9:g} "
+                "s at most are needed; are the stamps in ms or µs? TUM files have seconds, CSV has ns"
+            )
+        seen_ns = len(t) * self.spacing_ns
+        if t[-1] - t[0] <= min(max(_MAX_DURATION_NS, _MAX_HIDDEN_FACTOR * seen_ns), _LONGEST_NS):
             return
         i = int(np.diff(t).argmax())
         raise DataError(

@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers.special_files import special
 
 from share.cli.main import cli
-from share.errors import CalibrationMismatchError, DataError
+from share.errors import CalibrationMismatchError, DataError, ShareError
 from share.geometry import se3
 from share.lab.calibrate.headset import fit_mount, mount_warnings, moved_warning
 from share.lab.mocap.trajectory import MocapTrajectory
@@ -39,12 +40,18 @@ def tracked(rng: np.random.Generator, T: np.ndarray, hz: float) -> np.ndarray:
     return se3.exp(rng.normal(size=6)) @ out @ se3.exp(tremble)
 
 
-def two_trackers(seed: int, roll_pitch_yaw=(0.5, 0.5, 0.9), loose_rad: float = 0.0, seconds: float = SECONDS):
+def two_trackers(
+    seed: int,
+    roll_pitch_yaw=(0.5, 0.5, 0.9),
+    loose_rad: float = 0.0,
+    seconds: float = SECONDS,
+    loose_m: float = 0.0,
+):
     """Return a device's and a headset's poses, and the offset of their clocks, s."""
     rng = np.random.default_rng(seed)
     t_device, t_headset = np.arange(0, seconds, 1 / 30), np.arange(-1, seconds + 1, 1 / 72)
     viewer_of_device, viewer = head_poses(rng, roll_pitch_yaw, t_device, t_headset)
-    turned = np.where(t_device[:, None] > seconds / 2, [[loose_rad, 0, 0, 0, 0, 0]], 0.0)
+    turned = np.where(t_device[:, None] > seconds / 2, [[loose_rad, 0, 0, 0, loose_m, 0]], 0.0)
     body = viewer_of_device @ se3.inverse(T_body_viewer @ se3.exp(turned))
     offset_s, start = rng.uniform(-0.4, 0.4), 10**12
     device = MocapTrajectory((t_device * 1e9).astype(np.int64) + start, tracked(rng, body, 30), "device")
@@ -83,6 +90,13 @@ def test_a_mount_that_slips_by_a_degree_is_said():
     assert warning is not None and "the mount moved by 1.0 deg" in warning
 
 
+@pytest.mark.parametrize("seed", [61, 62, 63])
+def test_a_mount_that_slips_by_8_mm_is_said(seed):
+    device, headset, _ = two_trackers(seed, loose_m=0.008)
+    warning = moved_warning(device, headset, fit_mount(device, headset))
+    assert warning is not None and "the mount moved by 0." in warning
+
+
 def test_too_short_and_of_two_heads_is_refused():
     device, headset, _ = two_trackers(5, seconds=10)
     with pytest.raises(DataError, match="10 s in common, 15 are needed"):
@@ -104,3 +118,34 @@ def test_command_writes_the_mount_and_says_its_sigmas(tmp_path):
     assert (tmp_path / "mount" / "headset.yaml").read_text().splitlines()[-1].startswith("  timeshift_s")
     missing = CliRunner().invoke(cli, [*arguments[:-1], str(tmp_path / "no.tum"), "--out", str(tmp_path)])
     assert missing.exit_code != 0
+
+
+@pytest.mark.parametrize(("factor", "apart"), [(1e3, "13.9 s"), (1e6, "13,888.9 s")])
+def test_stamps_in_another_unit_are_said(factor, apart):
+    headset = two_trackers(7)[1]
+    stamps = ((headset.stamps_ns - headset.stamps_ns[0]) * factor).astype(np.int64)
+    with pytest.raises(DataError, match=f"headset: poses are {apart} apart.*in ms or µs"):
+        MocapTrajectory(stamps, headset.T, "headset")
+
+
+def test_a_recording_with_a_hole_of_days_is_refused():
+    """Its two clocks would be found by rotations every 10 ms of all of it."""
+    stamps = np.arange(40_000) * 500_000_000
+    stamps[-1] += 25 * 3600 * 10**9
+    with pytest.raises(DataError, match="stamps jump by 90000 s"):
+        MocapTrajectory(stamps, np.repeat(np.eye(4)[None], len(stamps), 0))
+
+
+def test_a_damaged_line_is_left_out_and_a_pipe_is_said(tmp_path):
+    device, headset, _ = two_trackers(7)
+    for name, poses in (("odom.tum", device), ("quest.tum", headset)):
+        (tmp_path / name).write_text(format_tum(Trajectory(poses.stamps_ns, poses.T)))
+    lines = (tmp_path / "quest.tum").read_text().splitlines()
+    lines[100] = " ".join([lines[100].split()[0], "nan", *lines[100].split()[2:]])
+    (tmp_path / "quest.tum").write_text("\n".join(lines) + "\n")
+    arguments = ["calibrate", "headset", str(tmp_path / "odom.tum"), str(tmp_path / "quest.tum")]
+    done = CliRunner().invoke(cli, [*arguments, "--out", str(tmp_path / "mount")])
+    assert done.exit_code == 0 and "skipped as damaged: 1 of the lines" in done.output
+    special(tmp_path / "pipe.tum", "pipe")
+    refused = CliRunner().invoke(cli, [*arguments[:-1], str(tmp_path / "pipe.tum"), "--out", str(tmp_path)])
+    assert isinstance(refused.exception, ShareError) and "no such file" not in str(refused.exception)
