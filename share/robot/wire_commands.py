@@ -149,7 +149,7 @@ def robot_place(report: dict[str, Any]) -> RobotPlace:
     if goal is not None:
         text = f"to x {goal['x']:.2f} y {goal['y']:.2f} m for {goal['commander']}: {goal['status']}"
     short = printable(text)[:MAX_ANSWER_LENGTH]
-    if pose is None or map_id is None or max(abs(pose[0]), abs(pose[1])) > MAX_PLACE_M:
+    if pose is None or map_id is None or not all(abs(value) <= MAX_PLACE_M for value in pose[:2]):
         return RobotPlace(None, None, 0.0, 0.0, 0.0, short)
     x, y, yaw = pose
     return RobotPlace(None, map_id, x, y, yaw, short)
