@@ -102,9 +102,11 @@ class GotoRequested:
 
 @dataclass(frozen=True)
 class CancelRequested:
-    """A commander, any, wants the robot to stop."""
+    """A commander, any, wants the robot to stop. cancel_id (16 bytes): a final `GoalReport` on it follows;
+    empty: nobody waits for one."""
 
     commander: str
+    cancel_id: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,8 @@ class LimitSpeed:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """A report to a commander on `goal_id`. is_final: nothing follows. is_reached: the goal ended there."""
+    """A report to a commander on `goal_id`, or on the cancellation of that id. is_final: nothing follows.
+    is_reached: the goal ended there; of a cancellation: no goal is under way any more."""
 
     commander: str
     text: str

@@ -29,15 +29,17 @@ class WiredRobot:
         self.taken, self.goals = 0, 0
         self.bench.correct(self.bench.agent("ann", 1), MAP, np.eye(4))
         self.bench.client("bot", 21, drives_robot=True)
-        self.is_bridge_alive, self.is_navigating = True, True
+        self.is_bridge_alive = self.is_navigating = self.is_confirming = True
         self.accepted: list[bytes] = []  # goals that the robot's navigation has
         self.run(0.5)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
             self.bench.run(0.02)
-            self.drive.run(0.02)
+            effects = self.drive.run(0.02)
             if self.is_bridge_alive:
+                for effect in effects:
+                    self._take(effect)
                 self._serve()
 
     def _serve(self) -> None:
@@ -77,7 +79,9 @@ class WiredRobot:
 
     def _navigate(self) -> None:
         """Nav2 accepts what it is sent, and cancels what it is asked to."""
-        cancelled = {one.goal_id for one in self.drive.of(ev.CancelGoal)}
+        if not self.is_navigating:
+            return
+        cancelled = {one.goal_id for one in self.drive.of(ev.CancelGoal)} if self.is_confirming else set()
         goals = tuple(
             (goal, ev.GoalStatus.CANCELED if goal in cancelled else ev.GoalStatus.EXECUTING)
             for goal in self.accepted
@@ -435,3 +439,68 @@ def test_goals_that_are_not_confirmed_leave_room_for_others(robot) -> None:
     robot.goto(robot.commander("ann", 31), 1)
     robot.run(1)
     assert robot.has_goal
+
+
+def test_a_cancel_is_done_once_the_robot_confirms_it(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    robot.cancel(eve, 1)
+    robot.run(0.5)
+    assert robot.last(eve, 1).text == "no goal is under way" and robot.last(eve, 1).is_reached
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_confirming = False
+    robot.cancel(eve, 2)
+    robot.run(2)
+    assert not robot.last(eve, 2).is_final and robot.has_goal
+    robot.is_confirming = True
+    robot.run(0.3)
+    assert robot.last(eve, 2) == room.CommandState(2, "bot", "eve", "cancelled", True, True)
+    assert not robot.has_goal and robot.bench.clients[eve].is_idle
+
+
+def test_a_cancel_that_the_robot_does_not_confirm_says_so(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_confirming = False
+    robot.cancel(eve, 1)
+    robot.run(4)
+    text = "not confirmed by the robot: stop it by hand"
+    assert robot.last(eve, 1) == room.CommandState(1, "bot", "eve", text, True, False)
+    robot.cancel(eve, 2)  # one more is answered at once
+    robot.run(0.3)
+    assert robot.last(eve, 2).text == text and not robot.last(eve, 2).is_reached
+    assert robot.has_goal and robot.drive.of(ev.CancelGoal)
+
+
+def test_what_a_cancel_cannot_stop_is_said(robot) -> None:
+    eve, goal = robot.commander("eve", 32), bytes(16)
+    robot.is_navigating = False
+    for command, (driving, text) in enumerate(
+        [
+            (goal, "another program has sent the robot a goal; cancel it there"),
+            (
+                GOAL_PREFIX + goal[:8],
+                "a goal that nobody follows is being cancelled; not confirmed by the robot",
+            ),
+        ]
+    ):
+        robot.handle(ev.StatusReceived(((driving, ev.GoalStatus.EXECUTING),)))
+        robot.cancel(eve, command)
+        robot.run(0.3)
+        assert robot.last(eve, command).text.startswith(text)
+        assert robot.last(eve, command).is_final and not robot.last(eve, command).is_reached
+
+
+def test_a_flood_of_cancels_ends_and_holds_no_memory(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_confirming = False
+    for command in range(200):
+        robot.bench.said(eve, room.Cancel(command, "bot"))
+        robot.run(0.02)
+    assert len(robot.commands._known) <= 64
+    robot.cancel(eve, 500)
+    robot.run(4)
+    assert robot.last(eve, 500).is_final
