@@ -23,15 +23,18 @@ from share.wire.room_messages import (
     RobotPlace,
 )
 
+_MAX_PASSED = 4096  # commands; those under way are repeated twice a second
+
 
 class CommandService:
     """Passes commands to the bridges of robots, and what they say to commanders and all that want robots.
 
-    places: where each robot was last."""
+    places: where each robot was last. A bridge speaks only of the commands that were passed to it."""
 
     def __init__(self, out: EdgeOutput, clients: ClientRegistry, maps: KnownMaps) -> None:
         self._out, self._clients, self._maps = out, clients, maps
         self.places: dict[str, RobotPlace] = {}
+        self._passed: dict[tuple[str, int], str] = {}  # commander and number to robot; newest repeated last
 
     def on_command(self, event: PeerMessageReceived, client: Client, command: Goto | Cancel) -> None:
         """Pass a command on, or answer why not."""
@@ -59,8 +62,15 @@ class CommandService:
         else:
             if known is None:
                 self._record(client, command, bridge.name)
+            self._remember_passed((client.name, command.command), bridge.name)
             passed = replace(command, robot=bridge.name, commander=client.name)
             self._clients.send(bridge, self._in_present_map(passed))
+
+    def _remember_passed(self, command: tuple[str, int], robot: str) -> None:
+        self._passed.pop(command, None)
+        self._passed[command] = robot
+        if len(self._passed) > _MAX_PASSED:
+            del self._passed[next(iter(self._passed))]
 
     def _objection(
         self, event: PeerMessageReceived, client: Client, command: Goto | Cancel, bridge: Client | None
@@ -111,8 +121,12 @@ class CommandService:
     # ------------------------------------------------------------ from bridges
 
     def on_state(self, bridge: Client, state: CommandState) -> None:
-        """Pass on what becomes of a command: to its commander only from the robot that it was passed to."""
+        """Pass on what becomes of a command, from the robot that it was passed to and no other."""
         if not self._may_say(bridge):
+            return
+        if self._passed.get((state.commander, state.command)) != bridge.name:
+            reason = "states of commands that were not passed to it"
+            bridge.count("unexpected", reason, self._out.now_ns)
             return
         state = replace(state, robot=bridge.name)
         for client in self._clients:

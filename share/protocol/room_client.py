@@ -227,6 +227,9 @@ class RoomClient:
     def _on_command_state(self, state: room.CommandState) -> None:
         is_own = state.commander in ("", self._hello.name)
         one = self._commands.get(state.command) if is_own else None
+        if one is not None and not _is_same_robot(one.message.robot, state.robot):
+            self._print(f"robot '{state.robot}' answers for '{one.message.robot}'; ignored")
+            return
         if state.command in self._ended or (one is None and not self._hello.wants_robots):
             return  # late, or of another client of this name
         self._effects.append(ev.CommandChanged(state))
@@ -293,3 +296,8 @@ class RoomClient:
 
     def _print(self, text: str) -> None:
         self._effects += self._connection.print(text, self._now_ns)
+
+
+def _is_same_robot(commanded: str | None, answering: str | None) -> bool:
+    """Whether a state may be about a command. None: the only robot, before the first state; no robot."""
+    return commanded is None or answering is None or commanded == answering

@@ -10,11 +10,13 @@ from helpers.robot_drive import RobotDrive
 from helpers.room_bench import Air, RoomBench, at
 
 from share.protocol import room_events as ce
+from share.protocol.common_events import EdgeMessageReceived, PrintLine
 from share.robot import robot_events as ev
 from share.robot.goal_control import GOAL_PREFIX
 from share.robot.settings import RobotSettings
 from share.robot.wire_commands import LEASE_S, WireCommands
 from share.wire import room_messages as room
+from share.wire.codec import encode
 from share.wire.room_messages import Permission
 
 MAP, BOT = "ann-1/0", b"\0\0\0\0\0\0\0\x15"
@@ -504,3 +506,47 @@ def test_a_flood_of_cancels_ends_and_holds_no_memory(robot) -> None:
     robot.cancel(eve, 500)
     robot.run(4)
     assert robot.last(eve, 500).is_final
+
+
+def test_another_bridge_cannot_answer_a_commander_that_watches_robots(robot) -> None:
+    ann = robot.bench.client("ann", 31, wants_robots=True)
+    evil = robot.bench.client("evil", 66, drives_robot=True, wants_robots=True)
+    robot.bench.said(evil, room.CommandState(1, None, "ann", "reached", True, True))  # before its time
+    robot.run(0.1)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.bench.said(evil, room.CommandState(1, None, "ann", "reached", True, True))
+    robot.bench.said(evil, room.CommandState(7, None, "bob", "reached", True, True))
+    robot.run(4)
+    assert robot.has_goal and not robot.bench.clients[ann].is_idle
+    assert {one.state.robot for one in robot.bench.of(ann, ce.CommandChanged)} == {"bot"}
+    robot.bench.said(evil, room.CommandState(2, None, "ann", "stopped: nothing", True))
+    robot.cancel(ann, 2)
+    robot.run(0.5)
+    assert robot.last(ann, 2).text == "cancelled" and not robot.has_goal
+
+
+def test_a_goal_for_the_only_robot_stays_its_own_where_an_evil_one_comes(robot) -> None:
+    ann = robot.bench.client("ann", 31, wants_robots=True)
+    robot.run(0.1)
+    robot.goto(ann, 77, robot=None)
+    robot.bench.run(0.1)  # passed on; the bridge has not answered
+    evil = robot.bench.client("evil", 66, drives_robot=True, wants_robots=True)
+    robot.bench.run(0.1)
+    robot.bench.said(evil, room.CommandState(77, None, "ann", "1.20 m to go"))
+    robot.run(1.5)
+    assert robot.has_goal and not robot.bench.of(evil, ce.RobotCommanded)
+    assert {one.state.robot for one in robot.bench.of(ann, ce.CommandChanged)} == {"bot"}
+
+
+@pytest.mark.parametrize("robot_name", ["bot", None])
+def test_an_edge_that_answers_for_another_robot_is_not_believed(robot, robot_name) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1, robot=robot_name)
+    robot.run(1)
+    forged = room.CommandState(1, "nobody", "ann", "reached", True, True)
+    robot.bench.to_client(ann, EdgeMessageReceived(encode(forged)))
+    robot.run(1)
+    assert robot.has_goal and robot.last(ann, 1).text == "executing"
+    lines = [one.text for one in robot.bench.of(ann, PrintLine) if "nobody" in one.text]
+    assert lines == ["robot 'nobody' answers for 'bot'; ignored"]
