@@ -120,7 +120,7 @@ class ClientRegistry:
     def refuse(self, client: Client, kind: str, reason: str) -> str:
         """Count and record what a client may not do; return the reason."""
         client.count(kind, reason, self._out.now_ns)
-        self._out.record("refused", None, f"client '{client.name}': {reason}")
+        self._out.record("refused", None, f"client '{client.name}': {reason}", client=client.name)
         return reason
 
     def join(self, event: PeerMessageReceived, hello: ClientHello) -> Client | str | None:
@@ -144,12 +144,12 @@ class ClientRegistry:
         self._clients[event.peer_id] = client
         self._removed.pop(event.peer_id, None)
         what = "bridge of a robot" if hello.drives_robot else "client"
-        self._out.record("client joined", None, f"{what}, '{hello.name}'")
+        self._out.record("client joined", None, f"{what}, '{hello.name}'", client=hello.name)
         return client
 
     def leave(self, client: Client, reason: str) -> None:
         if self._clients.pop(client.id, None) is not None:
-            self._out.record("client left", None, f"'{client.name}': {reason}")
+            self._out.record("client left", None, f"'{client.name}': {reason}", client=client.name)
 
     def remove_silent(self) -> None:
         """Remove the clients that have been silent too long."""

@@ -110,7 +110,8 @@ class CommandService:
 
     def _record(self, client: Client, command: Goto | Cancel, robot: str) -> None:
         where = "stops" if isinstance(command, Cancel) else f"to x {command.x:.2f} y {command.y:.2f} m"
-        self._out.record("robot commanded", None, f"'{client.name}' sends robot '{robot}': {where}")
+        said = f"'{client.name}' sends robot '{robot}': {where}"
+        self._out.record("robot commanded", None, said, client=client.name)
 
     def _end(self, client: Client, command: Goto | Cancel, reason: str) -> None:
         text = printable(f"refused: {reason}")[:MAX_ANSWER_LENGTH]
@@ -134,7 +135,7 @@ class CommandService:
             if known is not None and known.robot == bridge.name:
                 if state.is_final and known.final is None:
                     said = f"robot '{bridge.name}', sent by '{client.name}': {state.text}"
-                    self._out.record("robot answered", None, said)
+                    self._out.record("robot answered", None, said, client=client.name)
                 client.remember_command(state.command, final=state if state.is_final else None)
                 self._clients.send(client, state)
             elif client.hello.wants_robots:

@@ -550,3 +550,21 @@ def test_an_edge_that_answers_for_another_robot_is_not_believed(robot, robot_nam
     assert robot.has_goal and robot.last(ann, 1).text == "executing"
     lines = [one.text for one in robot.bench.of(ann, PrintLine) if "nobody" in one.text]
     assert lines == ["robot 'nobody' answers for 'bot'; ignored"]
+
+
+def test_who_may_nothing_cannot_hide_what_others_command(robot) -> None:
+    robot.bench.rights["eve"] = frozenset()
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    for command in range(300):
+        robot.bench.said(eve, room.Cancel(command, "bot"))
+        robot.run(0.1)
+    for command in range(3):
+        robot.goto(ann, 2 * command, x=2.0 + command)
+        robot.run(0.5)
+        robot.cancel(ann, 2 * command + 1)
+        robot.run(0.5)
+    said = [line for line in robot.bench.reasons("robot commanded") if line.startswith("'ann' ")]
+    assert len(said) == 6
+    answered = [line for line in robot.bench.reasons("robot answered") if "sent by 'ann'" in line]
+    assert len(answered) == 6
+    assert len(robot.bench.reasons("robot commanded")) < 100  # of eve's 300
