@@ -23,6 +23,7 @@ from share.wire.room_messages import (
     RobotPlace,
 )
 
+GONE_S = 10.0  # a goal whose robot has no bridge for so long is ended
 _MAX_PASSED = 4096  # commands; those under way are repeated twice a second
 
 
@@ -54,11 +55,17 @@ class CommandService:
         bridge = None if robot is None else self._clients.bridge(robot)
         objection = self._objection(event, client, command, bridge)
         client.remember_command(command.command, None if bridge is None else bridge.name)
+        gone_s = client.mark_robot(command.command, bridge is not None, now_ns)
         if objection is not None:
             self._end(client, command, self._clients.refuse(client, "refused", objection))
         elif bridge is None:  # the repetition finds it when it is back; the robot stops by itself meanwhile
             text = f"robot '{robot or '?'}' is not connected"
-            self._clients.send(client, CommandState(command.command, command.robot, client.name, text))
+            if gone_s < GONE_S:
+                state = CommandState(command.command, command.robot, client.name, text)
+                self._clients.send(client, state)
+            else:
+                gone = f"robot '{robot or '?'}' has not been connected for {gone_s:.0f} s"
+                self._end(client, command, f"{gone}; give the goal again", "given up")
         else:
             if known is None:
                 self._record(client, command, bridge.name)
@@ -113,8 +120,8 @@ class CommandService:
         said = f"'{client.name}' sends robot '{robot}': {where}"
         self._out.record("robot commanded", None, said, client=client.name)
 
-    def _end(self, client: Client, command: Goto | Cancel, reason: str) -> None:
-        text = printable(f"refused: {reason}")[:MAX_ANSWER_LENGTH]
+    def _end(self, client: Client, command: Goto | Cancel, reason: str, kind: str = "refused") -> None:
+        text = printable(f"{kind}: {reason}")[:MAX_ANSWER_LENGTH]
         final = CommandState(command.command, command.robot, client.name, text, is_final=True)
         client.remember_command(command.command, final=final)
         self._clients.send(client, final)

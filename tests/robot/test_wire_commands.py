@@ -10,6 +10,7 @@ from helpers.robot_drive import RobotDrive
 from helpers.room_bench import Air, RoomBench, at
 
 from share.protocol import room_events as ce
+from share.protocol.command_service import GONE_S
 from share.protocol.common_events import EdgeMessageReceived, PrintLine
 from share.robot import robot_events as ev
 from share.robot.goal_control import GOAL_PREFIX
@@ -568,3 +569,17 @@ def test_who_may_nothing_cannot_hide_what_others_command(robot) -> None:
     answered = [line for line in robot.bench.reasons("robot answered") if "sent by 'ann'" in line]
     assert len(answered) == 6
     assert len(robot.bench.reasons("robot commanded")) < 100  # of eve's 300
+
+
+def test_a_goal_ends_where_the_bridge_is_gone_for_good(robot) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1)
+    robot.run(1)
+    del robot.bench.clients[BOT]
+    robot.is_bridge_alive = False
+    robot.run(3.5 + GONE_S - 1)
+    assert robot.last(ann, 1).text == "robot 'bot' is not connected" and not robot.last(ann, 1).is_final
+    robot.run(2)
+    text = "given up: robot 'bot' has not been connected for 10 s; give the goal again"
+    assert robot.last(ann, 1) == room.CommandState(1, "bot", "ann", text, True, False)
+    assert robot.bench.clients[ann].is_idle
