@@ -197,8 +197,9 @@ class RoomClient:
         if (one := self._requests.pop(receipt.request, None)) is None:
             return
         reason, is_removal = receipt.reason, isinstance(one.message, room.RemoveObject)
-        if is_removal and one.session != self._connection.sessions.session:
-            reason = ""  # the edge that it was sent to first may have done it
+        is_of_dead_edge = is_removal and one.session != self._connection.sessions.session
+        if is_of_dead_edge and reason == room.no_object_text(one.message.object_id):
+            reason = ""  # the edge that it was sent to first has done it, or it was never there
         numbers = (*one.replaced, receipt.request)
         self._effects += [ev.RequestAnswered(number, reason) for number in numbers]
 

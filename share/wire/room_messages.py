@@ -34,6 +34,11 @@ class Permission(StrEnum):
     OBJECTS = "objects"
 
 
+def no_object_text(object_id: int) -> str:
+    """Return the reason of a `Receipt` for an object that is not there."""
+    return f"there is no object {object_id}"
+
+
 def _check_number(name: str, value: int) -> None:
     if not 0 <= value <= _MAX_NUMBER:
         raise ValueError(f"{name}: {value} is outside 0 .. {_MAX_NUMBER}")
