@@ -9,6 +9,7 @@ import os
 import secrets
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import zmq
 from click.testing import CliRunner
+from helpers.raw_zmtp import RawPeer, message, parts
 from helpers.ros_bench import (
     ROS,
     RosRoom,
@@ -30,6 +32,7 @@ from helpers.ros_bench import (
 from share.cli.main import cli
 from share.errors import TransportError, UsageError
 from share.net.keys import generate_pair
+from share.net.tcp import resident_bytes
 from share.robot import robot_events as ev
 from share.robot import share_robot_node as robot_node
 from share.robot.node_link import NodeKeys, NodeLink, node_events
@@ -216,6 +219,57 @@ def test_a_node_that_is_silent_is_gone_and_the_next_is_heard(link: NodeLink, pri
     assert printed == ["the robot's node has connected", "the robot's node is gone"]
     with FakeNode(link) as node:
         assert node.run(foreign="map")
+
+
+STALE = b'{"version": 1, "at": 1, "seen": null}'
+
+
+def test_a_program_that_says_nothing_fresh_takes_no_place(link: NodeLink, printed: list[str]) -> None:
+    found = {"servers": 1, "odometry": 1, "others": [], "release": "jazzy", "participants": True, "has": ""}
+    with contextlib.ExitStack() as stack:
+        squatters = [stack.enter_context(FakeNode(link)) for _ in range(12)]
+        for one in squatters:
+            one.socket.send(STALE)
+        time.sleep(0.2)
+        assert link.poll(time.monotonic_ns()) == [] and printed == []
+        node = stack.enter_context(FakeNode(link))
+        for _ in range(4):
+            for one in squatters:
+                one.socket.send(STALE)
+            events = node.run(0.5, found=found)
+        assert events and events[-1].odometry_publishers == 1 and node.received
+    assert printed == ["the robot's node has connected"]
+
+
+@pytest.mark.parametrize(
+    ("flood", "is_endless"),
+    [(parts(1000, b"x" * 60_000), True), (parts(200_000), True), (message(STALE) * 500, False)],
+    ids=["message without end", "empty parts without end", "small messages"],
+)
+def test_a_flood_at_the_port_takes_no_memory_and_the_node_is_heard(
+    link: NodeLink, printed: list[str], flood: bytes, is_endless: bool
+) -> None:
+    with FakeNode(link) as node, RawPeer.joined(link.endpoint, b"evil") as evil:
+        assert node.run(foreign="map")
+        ends: list[float] = []
+
+        def send() -> None:
+            end = time.monotonic() + 4
+            while time.monotonic() < end and evil.send(flood):
+                pass
+            ends.append(end - time.monotonic())
+
+        before = resident_bytes()
+        thread = threading.Thread(target=send)
+        thread.start()
+        heard, most = 0, 0
+        while thread.is_alive():
+            heard += len(node.run(0.1, foreign="map"))
+            most = max(most, resident_bytes() - before)
+        thread.join()
+        assert heard and most < 100_000_000
+        if is_endless:
+            assert ends[0] > 0 and "disconnected" in printed[1]
 
 
 def test_the_right_key_enters_and_no_other(tmp_path: Path, printed: list[str]) -> None:
