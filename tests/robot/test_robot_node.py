@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import importlib.util
 import json
@@ -11,6 +12,8 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -342,6 +345,80 @@ def test_bad_words(tmp_path: Path, monkeypatch, capsys, words: list[str], text: 
     with pytest.raises(SystemExit) as ended:
         robot_node.main()
     assert ended.value.code == 2 and text in capsys.readouterr().err
+
+
+class _Topics(robot_node.RobotTopics):
+    """The node's topics without rclpy, which remember what is cancelled."""
+
+    def __init__(self) -> None:
+        self.node = self
+        self.outgoing, self.under_way, self.cancelled = deque(), [], []  # type: ignore[var-annotated]
+        self.lines: list[str] = []
+
+    def get_logger(self) -> _Topics:
+        return self
+
+    def _log(self, text: str, **_: object) -> None:
+        self.lines.append(text)
+
+    info = warning = error = _log
+
+    def cancel(self, goal_id: str) -> None:
+        self.cancelled.append(goal_id)
+
+
+def _bomb() -> str:
+    """A map of 1 GB in 1.4 MB."""
+    packer = zlib.compressobj(1)
+    data = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1 << 6)) + packer.flush()
+    fixed = {"size": [1 << 13, 1 << 13], "cells": base64.b64encode(data).decode()}
+    return json.dumps({**fixed, "resolution": 1, "origin": [0, 0, 0], "body": [0] * 7, "name": "x"})
+
+
+def test_what_no_bridge_sends_does_not_end_the_nodes_link(monkeypatch) -> None:
+    monkeypatch.setattr(robot_node, "zmq", zmq, raising=False)
+    topics, bridge = _Topics(), Freshness(5)
+    socket = zmq.Context.instance().socket(zmq.ROUTER)
+    port = socket.bind_to_random_port("tcp://127.0.0.1")
+    link = robot_node.BridgeLink(topics, f"tcp://127.0.0.1:{port}", None)
+    bomb = _bomb()
+    link.start()
+    bodies = [
+        "[" * 100_000,
+        '{"version": 1, "x": ' + "[" * 100_000 + "]" * 100_000 + "}",
+        "\udcff{",
+        '"goal": 5',
+        '"speed": ' + "9" * 5000,
+        '"speed": ' + "9" * 400,
+        '"fixed": ' + bomb,
+        '"fixed": {"size": [-1, 5], "cells": ""}',
+        '"cancel": []',
+    ]
+    try:
+        name = b""
+        for body in bodies:
+            while socket.poll(0) or not name:
+                name, data = socket.recv_multipart()
+                bridge.take(json.loads(data), time.monotonic_ns())
+            told = bridge.stamped({"version": VERSION}, time.monotonic_ns()).decode()
+            text = f"{told[:-1]}, {body}}}" if body.startswith('"') else body
+            socket.send_multipart([name, told.encode()])
+            socket.send_multipart([name, text.encode("utf-8", "surrogateescape")])
+            time.sleep(0.15)
+        assert link.is_alive()
+        topics.under_way = [GOAL.hex()]
+        end = time.monotonic() + 20
+        while len(topics.cancelled) < 2 and time.monotonic() < end:  # nothing comes any more
+            time.sleep(0.05)
+        assert topics.cancelled[-1] == GOAL.hex() and link.is_alive()
+        nonsense = [line for line in topics.lines if "is not understood" in line]
+        assert len(nonsense) == len(bodies) - 1 and any("a map of 8192 by 8192" in line for line in nonsense)
+    finally:
+        link.is_ended = True
+        link.join()
+        link._socket.close()
+        link._socket.context.term()
+        socket.close(0)
 
 
 # ------------------------------------------------------------ with a robot of rclpy
