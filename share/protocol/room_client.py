@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from share.errors import UsageError
+from share.errors import UsageError, printable
 from share.protocol import room_events as ev
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, SendToEdge, Tick
 from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
@@ -59,6 +59,7 @@ class RoomClient:
         self._commands: dict[int, _OpenCommand] = {}
         self._ended: deque[int] = deque(maxlen=MAX_OPEN)  # commands
         self._is_over = False
+        self._trouble = ""  # of the link
         self._effects: list[ev.ClientEffect] = []
         self._now_ns = 0
 
@@ -96,6 +97,8 @@ class RoomClient:
                 self._send_hello()
             case ev.MessageWanted():
                 self._on_wanted(event.message)
+            case ev.LinkTroubled():
+                self._trouble = event.text
             case ev.ClientEnded():
                 self._send_if_connected(m.Bye())
                 self._is_over = True
@@ -107,6 +110,7 @@ class RoomClient:
         return self._effects
 
     def _on_wanted(self, message: room.ClientUplink) -> None:
+        encode(message)  # what cannot be sent fails here, once, and not in each step
         match message:
             case room.PutObject() | room.RemoveObject():
                 self._on_request(message)
@@ -249,7 +253,8 @@ class RoomClient:
         self._end_command(command)
         text = f"no word from the robot for {_NO_WORD_S:g} s"
         if not self.is_connected:
-            text = "no edge answers"
+            reason = f": {printable(self._trouble)}" if self._trouble else ""
+            text = f"no edge answers{reason}"[: room.MAX_ANSWER_LENGTH]
         state = room.CommandState(command, one.message.robot, self._hello.name, text, is_final=True)
         self._effects.append(ev.CommandChanged(state))
 

@@ -583,3 +583,47 @@ def test_a_goal_ends_where_the_bridge_is_gone_for_good(robot) -> None:
     text = "given up: robot 'bot' has not been connected for 10 s; give the goal again"
     assert robot.last(ann, 1) == room.CommandState(1, "bot", "ann", text, True, False)
     assert robot.bench.clients[ann].is_idle
+
+
+def test_a_commander_whose_link_is_refused_reads_why(robot) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.bench.air.loss = 1.0
+    robot.bench.to_client(ann, ce.LinkTroubled("refused: its key is not authorized\x1b" + "x" * 300))
+    robot.run(11)
+    state = robot.last(ann, 1)
+    assert state.is_final and state.text.startswith("no edge answers: refused: its key is not authorized")
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "text"),
+    [
+        (room.RemoveObject, (1, 7.0), "object_id: has to be a whole number"),
+        (room.RemoveObject, (True, 7), "request: has to be a whole number"),
+        (room.Goto, (1, "bot", "", None, True, 2.0), "x: has to be a number, not bool"),
+        (room.Goto, (1, "bot", "", None, 1.0, "2"), "y: has to be a number, not str"),
+        (room.Goto, (1, "bot", "", None, 1.0, 2.0, 1j), "yaw: has to be a number, not complex"),
+        (room.Cancel, (1.0, "bot"), "command: has to be a whole number"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused_by_its_type(kind, arguments, text) -> None:
+    with pytest.raises(ValueError, match=text):
+        kind(*arguments)
+
+
+def test_other_real_numbers_are_sent_as_floats() -> None:
+    goal = room.Goto(1, "bot", "", None, np.float32(1.5), np.int64(2), np.float64(0.5))
+    assert room.RemoveObject(np.int64(1), np.int32(7)).object_id == 7
+    assert encode(goal) == encode(room.Goto(1, "bot", "", None, 1.5, 2.0, 0.5))
+
+
+def test_a_message_that_cannot_be_encoded_costs_itself_only(robot) -> None:
+    ann = robot.commander("ann", 31)
+    wrong = room.Goto(1, "bot", "", None, 1.0, 2.0)
+    object.__setattr__(wrong, "x", object())
+    with pytest.raises(AttributeError):
+        robot.bench.to_client(ann, ce.MessageWanted(wrong))
+    robot.goto(ann, 2)
+    robot.run(1)
+    assert robot.last(ann, 2).text == "executing" and robot.bench.clients[ann].is_connected
