@@ -46,7 +46,7 @@ def _check_number(name: str, value: int) -> None:
         raise ValueError(f"{name}: {value} is outside 0 .. {_MAX_NUMBER}")
 
 
-def _check_whole(name: str, value: int) -> None:
+def _check_whole(name: str, value: object) -> None:
     if not isinstance(value, Integral) or isinstance(value, bool):
         raise ValueError(f"{name}: has to be a whole number (int), not {type(value).__name__}")
 
@@ -56,7 +56,7 @@ def _check_object(object_id: int) -> None:
     checked_id("object_id", object_id)
 
 
-def _number(name: str, value: float) -> float:
+def _number(name: str, value: object) -> float:
     """Raises ValueError for what is no real number, such as text or True."""
     if not isinstance(value, Real) or isinstance(value, bool):
         raise ValueError(f"{name}: has to be a number, not {type(value).__name__}")
