@@ -47,7 +47,7 @@ def _check_number(name: str, value: int) -> None:
 
 
 def _check_whole(name: str, value: object) -> None:
-    if not isinstance(value, Integral) or isinstance(value, bool):
+    if isinstance(value, bool) or not isinstance(value, Integral):
         raise ValueError(f"{name}: has to be a whole number (int), not {type(value).__name__}")
 
 
@@ -58,7 +58,7 @@ def _check_object(object_id: int) -> None:
 
 def _number(name: str, value: object) -> float:
     """Raises ValueError for what is no real number, such as text or True."""
-    if not isinstance(value, Real) or isinstance(value, bool):
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise ValueError(f"{name}: has to be a number, not {type(value).__name__}")
     return float(value)
 
