@@ -39,7 +39,6 @@ _MAX_MESSAGE_BYTES = 1 << 16
 _OPTIONS: dict[int, int] = {zmq.ROUTER_MANDATORY: 1, zmq.SNDHWM: 50, zmq.MAXMSGSIZE: _MAX_MESSAGE_BYTES}
 _MAX_MESSAGES = 200  # in one poll
 _MAX_NODES = 8
-_GREET_NS = 3_000_000_000  # between words to a node that is not the one heard: it goes on cancelling
 _FIXED_S = 2.0  # between two attempts to give the node the map
 
 
@@ -63,8 +62,7 @@ class NodeLink:
         self._print_line, self._line_limiter = print_line, LineLimiter()
         self._nodes: dict[bytes, Freshness] = {}  # by the socket's name of each, oldest first
         self._heard_ns: dict[bytes, int] = {}
-        self._greeted_ns: dict[bytes, int] = {}
-        self._place: bytes | None = None  # the node that is heard: the first of which something fresh came
+        self._sent_ns = 0
         self._fixed: dict[str, Any] = {"name": secrets.token_hex(4)}
         self._fixed_timer = PeriodicTimer(_FIXED_S)
         self._link = ZmqSocket(zmq.ROUTER, _OPTIONS, target)
@@ -92,68 +90,40 @@ class NodeLink:
         for line in [] if self._guard is None else self._guard.take_reports():
             self._say(f"a program at the node's port: {line}", "guard")
         for name in [one for one, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_NS]:
-            self._forget(name)
-        if self._place is not None and self._nodes[self._place].is_silent(now_ns):
-            self._lose_place()
-        for name, greeted_ns in list(self._greeted_ns.items()):
-            is_heard = self._place in (None, name)
-            if now_ns - greeted_ns > (HEARTBEAT_NS if is_heard else _GREET_NS):
-                self._send_to(name, {}, now_ns)
+            del self._heard_ns[name], self._nodes[name]
+            if not self._nodes:
+                self._print_line("the robot's node is gone")
+        if now_ns - self._sent_ns > HEARTBEAT_NS:
+            self._send({})
         return events
-
-    def _forget(self, name: bytes) -> None:
-        del self._heard_ns[name], self._nodes[name], self._greeted_ns[name]
-        if name == self._place:
-            self._lose_place()
-
-    def _lose_place(self) -> None:
-        self._place = None
-        self._print_line("the robot's node is gone")
-
-    def _count_nodes(self, now_ns: int) -> int:
-        """Return of how many nodes something fresh came lately: one that never hears us is none."""
-        heard = (one.heard_ns for one in self._nodes.values())
-        return sum(one is not None and now_ns - one < _GREET_NS + SILENT_NS for one in heard)
-
-    def _freshness_of(self, name: bytes, now_ns: int) -> Freshness | None:
-        """Return what is known of a node; of a new one, in the place of one that says nothing fresh. None:
-        there are too many."""
-        if name not in self._nodes:
-            if len(self._nodes) >= _MAX_NODES:
-                stale = [one for one, fresh in self._nodes.items() if fresh.is_silent(now_ns)]
-                if not stale:
-                    return None
-                self._forget(stale[0])
-            self._nodes[name] = Freshness(secrets.randbits(61))
-            self._greeted_ns[name] = now_ns - _GREET_NS  # now: without a word of ours it is not fresh
-        self._heard_ns[name] = now_ns
-        return self._nodes[name]
 
     def _take(self, parts: list[zmq.Frame], now_ns: int) -> list[ev.RobotEvent]:
         if len(parts) != 2:
             return []
         name = parts[0].bytes
+        if name not in self._nodes and len(self._nodes) >= _MAX_NODES:
+            return []
         try:
             message = parse_json(parts[1].bytes)
             if message["version"] != VERSION:
                 self._say("the robot's node is of another release; write it anew with `share robot node`")
                 return []
-            fresh = self._freshness_of(name, now_ns)
-            if fresh is None or not fresh.take(message, now_ns):
-                return []
-            if self._place is None:
-                self._place = name
+            if not self._nodes:
                 self._print_line("the robot's node has connected")
-            return self._events(message, now_ns) if name == self._place else []
+            fresh = self._nodes.setdefault(name, Freshness(secrets.randbits(61)))
+            self._heard_ns[name] = now_ns
+            if not fresh.take(message, now_ns) or name != next(iter(self._nodes)):
+                return []
+            return self._events(message)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             text = f"what comes from the robot's node is not understood: {printable(str(error))[:80]}"
             self._say(text, "nonsense")
             return []
 
-    def _events(self, message: dict[str, Any], now_ns: int) -> list[ev.RobotEvent]:
+    def _events(self, message: dict[str, Any]) -> list[ev.RobotEvent]:
         if "found" in message and message["found"]["has"] != self._fixed["name"]:
             self._offer_fixed()
-        return node_events(message, time.time_ns(), self._count_nodes(now_ns))
+        return node_events(message, time.time_ns(), len(self._nodes))
 
     # ------------------------------------------------------------ out
 
@@ -191,12 +161,9 @@ class NodeLink:
 
     def _send(self, message: dict[str, Any]) -> None:
         """Send to the node; nothing waits for one that is not there."""
-        if self._place is not None:
-            self._send_to(self._place, message, time.monotonic_ns())
-
-    def _send_to(self, name: bytes, message: dict[str, Any], now_ns: int) -> None:
-        self._greeted_ns[name] = now_ns
-        self._link.send([name, self._nodes[name].stamped({"version": VERSION, **message}, now_ns)])
+        self._sent_ns = time.monotonic_ns()
+        for name, fresh in list(self._nodes.items())[:1]:
+            self._link.send([name, fresh.stamped({"version": VERSION, **message}, self._sent_ns)])
 
     def close(self) -> None:
         if self._gate is not None:

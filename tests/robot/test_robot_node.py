@@ -227,23 +227,6 @@ def test_a_node_that_is_silent_is_gone_and_the_next_is_heard(link: NodeLink, pri
 STALE = b'{"version": 1, "at": 1, "seen": null}'
 
 
-def test_a_program_that_says_nothing_fresh_takes_no_place(link: NodeLink, printed: list[str]) -> None:
-    found = {"servers": 1, "odometry": 1, "others": [], "release": "jazzy", "participants": True, "has": ""}
-    with contextlib.ExitStack() as stack:
-        squatters = [stack.enter_context(FakeNode(link)) for _ in range(12)]
-        for one in squatters:
-            one.socket.send(STALE)
-        time.sleep(0.2)
-        assert link.poll(time.monotonic_ns()) == [] and printed == []
-        node = stack.enter_context(FakeNode(link))
-        for _ in range(4):
-            for one in squatters:
-                one.socket.send(STALE)
-            events = node.run(0.5, found=found)
-        assert events and events[-1].odometry_publishers == 1 and node.received
-    assert printed == ["the robot's node has connected"]
-
-
 @pytest.mark.parametrize(
     ("flood", "is_endless"),
     [(parts(1000, b"x" * 60_000), True), (parts(200_000), True), (message(STALE) * 500, False)],
