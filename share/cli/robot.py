@@ -338,14 +338,15 @@ def goto(
 @_namespace
 @_over_wire
 def cancel(**robot_options: Any) -> None:
-    """Cancel the robot's goal, whoever gave it.
+    """Cancel the robot's goal, whoever gave it, and wait until the robot confirms that it has ended. Exit
+    code 1 if it does not within 3 s (5 s, of a goal that it has not taken yet): stop it by hand.
 
     \b
     Example:  share robot cancel
     """
     *_, last = (_BRIDGE_ENDED, *_reach(**robot_options).cancel())
     if not last.is_reached:
-        raise ShareError(f"the robot was not stopped: {last.text}")
+        raise ShareError(f"the robot's stop: {last.text}")
     click.echo(last.text)
 
 

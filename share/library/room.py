@@ -173,7 +173,11 @@ class RoomThread(BackgroundRun):
 
     def stop_robot(self, robot: str | None = None) -> None:
         """Stop a robot, whoever sent it. Returns at once."""
-        self._post(ev.MessageWanted(Cancel(next(self._link.numbers), robot)))
+        try:
+            message = Cancel(next(self._link.numbers), robot)
+        except (ValueError, TypeError) as error:
+            raise UsageError(str(error)) from None
+        self._post(ev.MessageWanted(message))
 
     # ------------------------------------------------------------ the thread
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from share.protocol.admission import NAME_HOLD_S, name_objection
 from share.protocol.edge_events import PeerMessageReceived, SendToPeer
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.peer import Sender
-from share.timing import TokenBuckets, seconds_to_ns
+from share.timing import SECOND_NS, TokenBuckets, seconds_to_ns
 from share.wire.codec import encode, message_bytes
 from share.wire.messages import Pong, Refused, Welcome
 from share.wire.room_messages import ClientDownlink, ClientHello, ClientUplink, CommandState, Permission
@@ -28,10 +28,11 @@ Downlink = Welcome | Refused | Pong | ClientDownlink | ClientUplink
 @dataclass(frozen=True)
 class ForwardedCommand:
     """A command of a client. robot: to which it was passed; None: to none yet. final: its last state, if
-    nothing follows."""
+    nothing follows. gone_ns: since when its robot has no bridge; None: it has one."""
 
     robot: str | None = None
     final: CommandState | None = None
+    gone_ns: int | None = None
 
 
 @dataclass(eq=False)
@@ -69,10 +70,17 @@ class Client(Sender):
     ) -> None:
         """robot, final: as of `ForwardedCommand`; the first of each counts."""
         known = self.commands.get(command, ForwardedCommand())
-        self.commands[command] = ForwardedCommand(known.robot or robot, known.final or final)
+        self.commands[command] = replace(known, robot=known.robot or robot, final=known.final or final)
         self.newest_command = max(self.newest_command, command)
         while len(self.commands) > _MAX_COMMANDS:
             del self.commands[min(self.commands)]
+
+    def mark_robot(self, command: int, has_bridge: bool, now_ns: int) -> float:
+        """Note whether the robot of a command has a bridge. Return for how long it has had none, s."""
+        known = self.commands[command]
+        gone_ns = None if has_bridge else now_ns if known.gone_ns is None else known.gone_ns
+        self.commands[command] = replace(known, gone_ns=gone_ns)
+        return 0.0 if gone_ns is None else (now_ns - gone_ns) / SECOND_NS
 
 
 class ClientRegistry:
@@ -120,7 +128,7 @@ class ClientRegistry:
     def refuse(self, client: Client, kind: str, reason: str) -> str:
         """Count and record what a client may not do; return the reason."""
         client.count(kind, reason, self._out.now_ns)
-        self._out.record("refused", None, f"client '{client.name}': {reason}")
+        self._out.record("refused", None, f"client '{client.name}': {reason}", client=client.name)
         return reason
 
     def join(self, event: PeerMessageReceived, hello: ClientHello) -> Client | str | None:
@@ -144,12 +152,12 @@ class ClientRegistry:
         self._clients[event.peer_id] = client
         self._removed.pop(event.peer_id, None)
         what = "bridge of a robot" if hello.drives_robot else "client"
-        self._out.record("client joined", None, f"{what}, '{hello.name}'")
+        self._out.record("client joined", None, f"{what}, '{hello.name}'", client=hello.name)
         return client
 
     def leave(self, client: Client, reason: str) -> None:
         if self._clients.pop(client.id, None) is not None:
-            self._out.record("client left", None, f"'{client.name}': {reason}")
+            self._out.record("client left", None, f"'{client.name}': {reason}", client=client.name)
 
     def remove_silent(self) -> None:
         """Remove the clients that have been silent too long."""

@@ -23,15 +23,19 @@ from share.wire.room_messages import (
     RobotPlace,
 )
 
+GONE_S = 10.0  # a goal whose robot has no bridge for so long is ended
+_MAX_PASSED = 4096  # commands; those under way are repeated twice a second
+
 
 class CommandService:
     """Passes commands to the bridges of robots, and what they say to commanders and all that want robots.
 
-    places: where each robot was last."""
+    places: where each robot was last. A bridge speaks only of the commands that were passed to it."""
 
     def __init__(self, out: EdgeOutput, clients: ClientRegistry, maps: KnownMaps) -> None:
         self._out, self._clients, self._maps = out, clients, maps
         self.places: dict[str, RobotPlace] = {}
+        self._passed: dict[tuple[str, int], str] = {}  # commander and number to robot; newest repeated last
 
     def on_command(self, event: PeerMessageReceived, client: Client, command: Goto | Cancel) -> None:
         """Pass a command on, or answer why not."""
@@ -51,16 +55,29 @@ class CommandService:
         bridge = None if robot is None else self._clients.bridge(robot)
         objection = self._objection(event, client, command, bridge)
         client.remember_command(command.command, None if bridge is None else bridge.name)
+        gone_s = client.mark_robot(command.command, bridge is not None, now_ns)
         if objection is not None:
             self._end(client, command, self._clients.refuse(client, "refused", objection))
         elif bridge is None:  # the repetition finds it when it is back; the robot stops by itself meanwhile
             text = f"robot '{robot or '?'}' is not connected"
-            self._clients.send(client, CommandState(command.command, command.robot, client.name, text))
+            if gone_s < GONE_S:
+                state = CommandState(command.command, command.robot, client.name, text)
+                self._clients.send(client, state)
+            else:
+                gone = f"robot '{robot or '?'}' has not been connected for {gone_s:.0f} s"
+                self._end(client, command, f"{gone}; give the goal again", "given up")
         else:
             if known is None:
                 self._record(client, command, bridge.name)
+            self._remember_passed((client.name, command.command), bridge.name)
             passed = replace(command, robot=bridge.name, commander=client.name)
             self._clients.send(bridge, self._in_present_map(passed))
+
+    def _remember_passed(self, command: tuple[str, int], robot: str) -> None:
+        self._passed.pop(command, None)
+        self._passed[command] = robot
+        if len(self._passed) > _MAX_PASSED:
+            del self._passed[next(iter(self._passed))]
 
     def _objection(
         self, event: PeerMessageReceived, client: Client, command: Goto | Cancel, bridge: Client | None
@@ -100,10 +117,11 @@ class CommandService:
 
     def _record(self, client: Client, command: Goto | Cancel, robot: str) -> None:
         where = "stops" if isinstance(command, Cancel) else f"to x {command.x:.2f} y {command.y:.2f} m"
-        self._out.record("robot commanded", None, f"'{client.name}' sends robot '{robot}': {where}")
+        said = f"'{client.name}' sends robot '{robot}': {where}"
+        self._out.record("robot commanded", None, said, client=client.name)
 
-    def _end(self, client: Client, command: Goto | Cancel, reason: str) -> None:
-        text = printable(f"refused: {reason}")[:MAX_ANSWER_LENGTH]
+    def _end(self, client: Client, command: Goto | Cancel, reason: str, kind: str = "refused") -> None:
+        text = printable(f"{kind}: {reason}")[:MAX_ANSWER_LENGTH]
         final = CommandState(command.command, command.robot, client.name, text, is_final=True)
         client.remember_command(command.command, final=final)
         self._clients.send(client, final)
@@ -111,8 +129,12 @@ class CommandService:
     # ------------------------------------------------------------ from bridges
 
     def on_state(self, bridge: Client, state: CommandState) -> None:
-        """Pass on what becomes of a command: to its commander only from the robot that it was passed to."""
+        """Pass on what becomes of a command, from the robot that it was passed to and no other."""
         if not self._may_say(bridge):
+            return
+        if self._passed.get((state.commander, state.command)) != bridge.name:
+            reason = "states of commands that were not passed to it"
+            bridge.count("unexpected", reason, self._out.now_ns)
             return
         state = replace(state, robot=bridge.name)
         for client in self._clients:
@@ -120,7 +142,7 @@ class CommandService:
             if known is not None and known.robot == bridge.name:
                 if state.is_final and known.final is None:
                     said = f"robot '{bridge.name}', sent by '{client.name}': {state.text}"
-                    self._out.record("robot answered", None, said)
+                    self._out.record("robot answered", None, said, client=client.name)
                 client.remember_command(state.command, final=state if state.is_final else None)
                 self._clients.send(client, state)
             elif client.hello.wants_robots:

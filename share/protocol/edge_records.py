@@ -47,9 +47,9 @@ class EventLog:
     def throttled_event(
         self, now_ns: int, kind: EventKind, agent: str | None, reason: str, **fields: Any
     ) -> WriteEvent | None:
-        """Return the event, or None beyond the limits of its kind and agent, or map where it concerns no
-        agent; the next one counts those left out."""
-        key = kind, agent, fields.get("map_id") if agent is None else None
+        """Return the event, or None beyond the limits of its kind and of who caused it (agent or client), or
+        of its map where nobody did; the next one counts those left out."""
+        key = kind, agent, fields.get("client"), fields.get("map_id") if agent is None else None
         suppressed = self._throttle.admit(key, now_ns)
         if suppressed is not None:
             suppressed = self._sustained.admit(key, now_ns, suppressed)

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from share.errors import UsageError
+from share.errors import UsageError, printable
 from share.protocol import room_events as ev
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, SendToEdge, Tick
 from share.protocol.edge_connection import EdgeConnection, WelcomeOutcome
@@ -59,6 +59,7 @@ class RoomClient:
         self._commands: dict[int, _OpenCommand] = {}
         self._ended: deque[int] = deque(maxlen=MAX_OPEN)  # commands
         self._is_over = False
+        self._trouble = ""  # of the link
         self._effects: list[ev.ClientEffect] = []
         self._now_ns = 0
 
@@ -96,6 +97,8 @@ class RoomClient:
                 self._send_hello()
             case ev.MessageWanted():
                 self._on_wanted(event.message)
+            case ev.LinkTroubled():
+                self._trouble = event.text
             case ev.ClientEnded():
                 self._send_if_connected(m.Bye())
                 self._is_over = True
@@ -107,6 +110,7 @@ class RoomClient:
         return self._effects
 
     def _on_wanted(self, message: room.ClientUplink) -> None:
+        encode(message)  # what cannot be sent fails here, once, and not in each step
         match message:
             case room.PutObject() | room.RemoveObject():
                 self._on_request(message)
@@ -197,8 +201,9 @@ class RoomClient:
         if (one := self._requests.pop(receipt.request, None)) is None:
             return
         reason, is_removal = receipt.reason, isinstance(one.message, room.RemoveObject)
-        if is_removal and one.session != self._connection.sessions.session:
-            reason = ""  # the edge that it was sent to first may have done it
+        is_of_dead_edge = is_removal and one.session != self._connection.sessions.session
+        if is_of_dead_edge and reason == room.no_object_text(one.message.object_id):
+            reason = ""  # the edge that it was sent to first has done it, or it was never there
         numbers = (*one.replaced, receipt.request)
         self._effects += [ev.RequestAnswered(number, reason) for number in numbers]
 
@@ -227,6 +232,9 @@ class RoomClient:
     def _on_command_state(self, state: room.CommandState) -> None:
         is_own = state.commander in ("", self._hello.name)
         one = self._commands.get(state.command) if is_own else None
+        if one is not None and not _is_same_robot(one.message.robot, state.robot):
+            self._print(f"robot '{state.robot}' answers for '{one.message.robot}'; ignored")
+            return
         if state.command in self._ended or (one is None and not self._hello.wants_robots):
             return  # late, or of another client of this name
         self._effects.append(ev.CommandChanged(state))
@@ -245,7 +253,8 @@ class RoomClient:
         self._end_command(command)
         text = f"no word from the robot for {_NO_WORD_S:g} s"
         if not self.is_connected:
-            text = "no edge answers"
+            reason = f": {printable(self._trouble)}" if self._trouble else ""
+            text = f"no edge answers{reason}"[: room.MAX_ANSWER_LENGTH]
         state = room.CommandState(command, one.message.robot, self._hello.name, text, is_final=True)
         self._effects.append(ev.CommandChanged(state))
 
@@ -293,3 +302,8 @@ class RoomClient:
 
     def _print(self, text: str) -> None:
         self._effects += self._connection.print(text, self._now_ns)
+
+
+def _is_same_robot(commanded: str | None, answering: str | None) -> bool:
+    """Whether a state may be about a command. None: the only robot, before the first state; no robot."""
+    return commanded is None or answering is None or commanded == answering

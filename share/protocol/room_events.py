@@ -36,11 +36,18 @@ class MessageWanted:
 
 
 @dataclass(frozen=True)
+class LinkTroubled:
+    """Why the link does not reach the edge, as far as it knows; empty: no more."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class ClientEnded:
     """The run is over."""
 
 
-ClientEvent = Connected | EdgeMessageReceived | MessageWanted | ClientEnded | Tick
+ClientEvent = Connected | EdgeMessageReceived | MessageWanted | LinkTroubled | ClientEnded | Tick
 
 # ---------------------------------------------------------------- effects
 

@@ -14,7 +14,7 @@ from share.mapping.map_changes import SaveObject
 from share.protocol.known_maps import MapMoved
 from share.timing import seconds_to_ns
 from share.types import F64
-from share.wire.room_messages import MAX_LISTED, ObjectKind, ObjectList, RoomObject
+from share.wire.room_messages import MAX_LISTED, ObjectKind, ObjectList, RoomObject, no_object_text
 
 MAX_OBJECTS = 64
 MAX_OWNED = 16
@@ -59,7 +59,7 @@ class RoomObjects:
     def remove(self, object_id: int, reason: str, now_ns: int) -> RoomObject:
         """Remove an object; return it as its removal is sent."""
         if (kept := self._kept.pop(object_id, None)) is None:
-            raise ValueError(f"there is no object {object_id}")
+            raise ValueError(no_object_text(object_id))
         self.revision += 1
         gone = replace(kept.object, revision=self.revision, removed=reason)
         self._missing.discard(object_id)

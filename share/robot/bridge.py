@@ -62,6 +62,7 @@ class RobotBridge:
                 self._on_goto(event)
             case ev.CancelRequested():
                 self._stop(f"cancelled by {event.commander}")
+                self._effects += self._goals.take_cancel(event)
             case ev.CommanderLost():
                 goal = self._goals.active
                 if goal is not None and goal.commander == event.commander:

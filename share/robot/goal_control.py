@@ -20,6 +20,7 @@ _REFUSED_S = 0.5  # a refusal counts if no status contradicts it by then
 _RESULT_S = 1.0  # wait so long for the reason of a failure
 _REPEAT_S = 0.5  # of a cancellation that is not confirmed, and of the speed limit
 _UNCONFIRMED_S = 3.0
+UNCONFIRMED = "not confirmed by the robot: stop it by hand"
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class GoalControl:
     def __init__(self) -> None:
         self.active: ActiveGoal | None = None
         self.is_driven_by_others = False  # another program's goal is under way
+        self._has_orphans = False  # a goal of SHARE that nobody follows is
+        self._cancels: list[ev.CancelRequested] = []  # that wait for the end of the goal under way
         self._cancel_timer, self._orphan_timer = PeriodicTimer(_REPEAT_S), PeriodicTimer(_REPEAT_S)
 
     def begin(self, goal: ActiveGoal, stamp_ns: int) -> list[ev.RobotEffect]:
@@ -53,6 +56,7 @@ class GoalControl:
         effects: list[ev.RobotEffect] = []
         if self.active is not None:
             effects.append(_report(self.active, "replaced by a newer goal", is_final=True))
+            effects += self._answer_cancels("not confirmed: a newer goal has come", is_reached=False)
         self.active = goal
         where = f"x {goal.T_map_base.x:.2f} y {goal.T_map_base.y:.2f} m"
         effects.append(ev.SendGoal(goal.goal_id, stamp_ns, goal.T_map_base))
@@ -69,6 +73,19 @@ class GoalControl:
             ev.CancelGoal(self.active.goal_id),
             _report(self.active, f"stopping: {reason}"),
         ]
+
+    def take_cancel(self, event: ev.CancelRequested) -> list[ev.RobotEffect]:
+        """Answer a wish to stop, which `stop` carries out, now or at the end of the goal under way."""
+        self._cancels.append(event)
+        if self.active is not None:
+            return self._answer_cancels(UNCONFIRMED, False) if self.active.is_unconfirmed else []
+        if self._has_orphans:
+            return self._answer_cancels(
+                f"a goal that nobody follows is being cancelled; {UNCONFIRMED}", False
+            )
+        if self.is_driven_by_others:
+            return self._answer_cancels("another program has sent the robot a goal; cancel it there", False)
+        return self._answer_cancels("no goal is under way", is_reached=True)
 
     def take_status(self, event: ev.StatusReceived, now_ns: int) -> list[ev.RobotEffect]:
         """Follow the robot's list of goals."""
@@ -138,7 +155,8 @@ class GoalControl:
             waited_ns = now_ns - max(goal.sent_ns, goal.stopped_ns)
             if goal.status is ev.GoalStatus.UNKNOWN and waited_ns > seconds_to_ns(ACCEPT_S):
                 text = f"stopped: {goal.stop_reason}; the robot's navigation never took the goal"
-                return [ev.CancelGoal(goal.goal_id), *self._end(text)]  # a late start is an orphan
+                answers = self._answer_cancels(f"{UNCONFIRMED} if it drives: it never took the goal", False)
+                return [ev.CancelGoal(goal.goal_id), *answers, *self._end(text)]  # a late start is an orphan
             return self._repeat_cancel(goal, goal.stopped_ns, now_ns)
         if goal.status is ev.GoalStatus.UNKNOWN:
             if goal.refused_ns is not None and now_ns - goal.refused_ns > seconds_to_ns(_REFUSED_S):
@@ -157,6 +175,7 @@ class GoalControl:
             self.active = replace(goal, is_unconfirmed=True)
             text = "the robot does not confirm that it stops; stop it by hand"
             effects += [PrintLine(text), _report(goal, text)]
+            effects += self._answer_cancels(UNCONFIRMED, is_reached=False)
         return effects
 
     def _cancel_orphans(self, statuses: dict[bytes, ev.GoalStatus], now_ns: int) -> list[ev.RobotEffect]:
@@ -168,6 +187,7 @@ class GoalControl:
             for goal_id, status in statuses.items()
             if goal_id.startswith(GOAL_PREFIX) and goal_id != own and status in _UNDER_WAY
         ]
+        self._has_orphans = bool(orphans)
         if not orphans or not self._orphan_timer.fire_if_due(now_ns):
             return []
         text = "the robot was still driving to a goal that nobody follows; it is cancelled"
@@ -176,8 +196,19 @@ class GoalControl:
     def _end(self, text: str, is_reached: bool = False) -> list[ev.RobotEffect]:
         assert self.active is not None
         report = _report(self.active, text, is_final=True, is_reached=is_reached)
+        is_stopped = self.active.stopped_ns is not None and not is_reached
         self.active = None
-        return [report]
+        answer = "cancelled" if is_stopped else f"the goal had ended: {text}"
+        return [report, *self._answer_cancels(answer, is_reached=True)]
+
+    def _answer_cancels(self, text: str, is_reached: bool) -> list[ev.RobotEffect]:
+        """Tell all who wait for the end of the goal."""
+        waiting, self._cancels = self._cancels, []
+        return [
+            ev.GoalReport(one.commander, text, is_final=True, is_reached=is_reached, goal_id=one.cancel_id)
+            for one in waiting
+            if one.cancel_id
+        ]
 
 
 _UNDER_WAY = (ev.GoalStatus.ACCEPTED, ev.GoalStatus.EXECUTING)

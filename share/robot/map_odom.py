@@ -159,8 +159,8 @@ class MapOdom:
 
 
 def _odometry_fault(event: ev.OdometryReceived) -> str | None:
-    if not event.T_odom_base.is_finite:
-        return "the robot's odometry has values that are not finite; restart its base"
+    if event.problem is not None:
+        return event.problem
     if 0 <= event.stamp_ns < _SIMULATED_NS < event.unix_ns:
         return "the robot's clock begins at 0, as in a simulation; turn use_sim_time off"
     if abs(event.stamp_ns - event.unix_ns) > _CLOCK_LIMIT_NS:

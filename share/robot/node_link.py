@@ -21,9 +21,12 @@ from zmq.utils import z85
 from share.errors import printable
 from share.files.json_file import parse_json
 from share.geometry.se3 import quat_from_matrix
+from share.net.backlog import BacklogLimits, wire_bytes
+from share.net.connection_gate import Blocklist
+from share.net.connection_guard import ConnectionGuard
 from share.net.keys import KeyPair
 from share.net.transport import bind_error, check_keys, parse_address
-from share.net.zeromq_socket import ZmqSocket, make_curve_server
+from share.net.zeromq_socket import MAX_PARTS, ZmqSocket, make_curve_server
 from share.robot import robot_events as ev
 from share.robot.grid import FloorMap
 from share.robot.planar import PlanarPose
@@ -32,7 +35,8 @@ from share.timing import LineLimiter, PeriodicTimer
 from share.types import F64
 
 _ZAP_DOMAIN = b"share-node"
-_OPTIONS: dict[int, int] = {zmq.ROUTER_MANDATORY: 1, zmq.SNDHWM: 50, zmq.MAXMSGSIZE: 1 << 16}
+_MAX_MESSAGE_BYTES = 1 << 16
+_OPTIONS: dict[int, int] = {zmq.ROUTER_MANDATORY: 1, zmq.SNDHWM: 50, zmq.MAXMSGSIZE: _MAX_MESSAGE_BYTES}
 _MAX_MESSAGES = 200  # in one poll
 _MAX_NODES = 8
 _FIXED_S = 2.0  # between two attempts to give the node the map
@@ -63,6 +67,7 @@ class NodeLink:
         self._fixed_timer = PeriodicTimer(_FIXED_S)
         self._link = ZmqSocket(zmq.ROUTER, _OPTIONS, target)
         self._gate = None if keys is None else _NodeGate(self._link, keys)
+        self._guard = _PortGuard(self._link) if keys is None else None  # any program here may connect
         try:
             self._link.socket.bind(str(target))
         except zmq.ZMQError as error:
@@ -76,11 +81,14 @@ class NodeLink:
         """Return what has come; never waits."""
         if self._gate is not None and self._gate.serve():
             self._say(f"a node was refused: its key is not that of --node-key ({self.endpoint})")
+        receive = self._link.receive_now if self._guard is None else self._guard.receive_now
         events: list[ev.RobotEvent] = []
         for _ in range(_MAX_MESSAGES):
-            if (parts := self._link.receive_now()) is None:
+            if (parts := receive()) is None:
                 break
             events += self._take(parts, now_ns)
+        for line in [] if self._guard is None else self._guard.take_reports():
+            self._say(f"a program at the node's port: {line}", "guard")
         for name in [one for one, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_NS]:
             del self._heard_ns[name], self._nodes[name]
             if not self._nodes:
@@ -90,8 +98,10 @@ class NodeLink:
         return events
 
     def _take(self, parts: list[zmq.Frame], now_ns: int) -> list[ev.RobotEvent]:
+        if len(parts) != 2:
+            return []
         name = parts[0].bytes
-        if len(parts) != 2 or (name not in self._nodes and len(self._nodes) >= _MAX_NODES):
+        if name not in self._nodes and len(self._nodes) >= _MAX_NODES:
             return []
         try:
             message = parse_json(parts[1].bytes)
@@ -158,6 +168,8 @@ class NodeLink:
     def close(self) -> None:
         if self._gate is not None:
             self._gate.close()
+        if self._guard is not None:
+            self._guard.close()
         self._link.close()
 
     def _say(self, text: str, kind: str | None = None) -> None:
@@ -188,6 +200,40 @@ class _NodeGate:
 
     def close(self) -> None:
         self._requests.close(0)
+
+
+class _PortGuard:
+    """Bounds what libzmq holds of each connection. Must be created before the socket is bound."""
+
+    def __init__(self, link: ZmqSocket) -> None:
+        self._link = link
+        limits = BacklogLimits.for_frame_size(_MAX_MESSAGE_BYTES)
+        self._guard = ConnectionGuard(link.socket, limits, Blocklist(), link.wake)
+
+    def receive_now(self) -> list[zmq.Frame] | None:
+        """Return the next message; empty: one to be discarded; None: there is none."""
+        self._guard.check()
+        if (parts := self._link.receive_now()) is None:
+            self._guard.record_empty(self._link.last_empty_s)
+            return None
+        try:
+            descriptor = int(parts[0].get(zmq.SRCFD))
+        except zmq.ZMQError:  # a ZMTP 1.0 peer has none
+            return []
+        if self._guard.is_discarding(descriptor):
+            return []
+        size = sum(wire_bytes(len(part), is_encrypted=False) for part in parts[1:])
+        self._guard.deliver(descriptor, size, len(parts) - 1, "")
+        if len(parts) > MAX_PARTS:
+            self._guard.report_offence(descriptor, "a message of too many parts")
+        return parts
+
+    def take_reports(self) -> list[str]:
+        """Return a line for each disconnection since the last call."""
+        return self._guard.take_reports()
+
+    def close(self) -> None:
+        self._guard.close()
 
 
 def node_events(message: dict[str, Any], unix_ns: int, nodes: int) -> list[ev.RobotEvent]:

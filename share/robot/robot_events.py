@@ -5,12 +5,17 @@ Its time is the host's monotonic clock, ns. A stamp is in the robot's clock, tha
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
 from share.protocol.common_events import PrintLine, Tick
 from share.robot.planar import PlanarPose
 from share.types import F64, TrackState
+
+MAX_ODOMETRY_M = 100_000.0  # from where the odometry began, along each axis
+MAX_ODOMETRY_RAD = 1e6  # of a yaw that is not wrapped
+MAX_STAMP_NS = 2**62
 
 # ---------------------------------------------------------------- events
 
@@ -38,13 +43,27 @@ class AgentPoseReceived:
 
 @dataclass(frozen=True)
 class OdometryReceived:
-    """The robot's odometry. T_odom_base may have values that are not finite. unix_ns: when it arrived.
+    """The robot's odometry, as it came: use it only where `problem` is None. unix_ns: when it arrived.
     speed_m_s: as the robot reports it."""
 
     stamp_ns: int
     unix_ns: int
     T_odom_base: PlanarPose
     speed_m_s: float
+
+    @property
+    def problem(self) -> str | None:
+        """Why no robot can mean this, for a person; None for a usable sample."""
+        T = self.T_odom_base
+        if not T.is_finite or not math.isfinite(self.speed_m_s):
+            return "the robot's odometry has values that are not finite; restart its base"
+        if max(abs(T.x), abs(T.y)) > MAX_ODOMETRY_M or abs(self.speed_m_s) > MAX_ODOMETRY_M:
+            return f"the robot's odometry is more than {MAX_ODOMETRY_M / 1000:g} km off; restart its base"
+        if abs(T.yaw) > MAX_ODOMETRY_RAD:
+            return f"the robot's odometry has a yaw of more than {MAX_ODOMETRY_RAD:g} rad; restart its base"
+        if not 0 <= self.stamp_ns < MAX_STAMP_NS:
+            return "the robot's odometry has a time of no clock; restart its base"
+        return None
 
 
 @dataclass(frozen=True)
@@ -83,9 +102,11 @@ class GotoRequested:
 
 @dataclass(frozen=True)
 class CancelRequested:
-    """A commander, any, wants the robot to stop."""
+    """A commander, any, wants the robot to stop. cancel_id (16 bytes): a final `GoalReport` on it follows;
+    empty: nobody waits for one."""
 
     commander: str
+    cancel_id: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -205,7 +226,8 @@ class LimitSpeed:
 
 @dataclass(frozen=True)
 class GoalReport:
-    """A report to a commander on `goal_id`. is_final: nothing follows. is_reached: the goal ended there."""
+    """A report to a commander on `goal_id`, or on the cancellation of that id. is_final: nothing follows.
+    is_reached: the goal ended there; of a cancellation: no goal is under way any more."""
 
     commander: str
     text: str

@@ -39,7 +39,7 @@ class BridgeCommand:
 
 class WireCommands:
     """Turns commands into events of the bridge, and its reports into states. Commands go by kind, commander
-    and number: each is used once.
+    and number: each is used once. A cancellation is final once the bridge has said what became of the goal.
 
     A goal begins once its commander has heard of the bridge (`has_begun`): one that waited in a queue while
     its commander went away begins nothing.
@@ -57,10 +57,10 @@ class WireCommands:
         if (known := self._known.get(key)) is not None:
             return self._repeat(known, command, now_ns)
         events: list[ev.RobotEvent] = []
-        goal_id, text, is_reached = b"", "", False
+        goal_id, text = b"", ""
         if isinstance(command, Cancel):
-            events = [ev.CancelRequested(commander_text(command.commander))]
-            text, is_reached = "cancelled", True
+            goal_id = make_goal_id()
+            events = [ev.CancelRequested(commander_text(command.commander), goal_id)]
         elif command.has_begun:
             text = "stopped: the robot's bridge was restarted; give the goal again"
         elif not self._make_room():
@@ -68,9 +68,10 @@ class WireCommands:
         else:
             goal_id = make_goal_id()
         is_final = not goal_id
-        state = CommandState(command.command, None, command.commander, text or "taken", is_final, is_reached)
+        state = CommandState(command.command, None, command.commander, text or "taken", is_final)
         self._make_room()
-        self._known[key] = BridgeCommand(goal_id, state, now_ns, is_begun=is_final)
+        is_begun = is_final or isinstance(command, Cancel)
+        self._known[key] = BridgeCommand(goal_id, state, now_ns, is_begun=is_begun)
         return events, [state]
 
     def _repeat(
@@ -105,7 +106,11 @@ class WireCommands:
     def tick(self, now_ns: int) -> tuple[list[ev.RobotEvent], list[CommandState]]:
         """Give up goals that are not repeated; return states on the way that were held back."""
         events: list[ev.RobotEvent] = []
-        lost = [one for one in self._known.values() if not (one.state.is_final or one.is_held(now_ns))]
+        lost = [
+            one
+            for (kind, *_), one in self._known.items()
+            if kind is Goto and not (one.state.is_final or one.is_held(now_ns))
+        ]
         for known in lost:
             if known.is_begun:
                 known.repeated_ns = now_ns  # said again where the robot goes on
@@ -125,13 +130,13 @@ class WireCommands:
         return robot_place(report()) if self._place_timer.fire_if_due(now_ns) else None
 
     def _make_room(self) -> bool:
-        """Forget one of too many commands: the oldest final one, else one that never began. Return whether
-        there is room."""
+        """Forget one of too many commands: the oldest final one, else one that never began, else a
+        cancellation, whose repetition is answered anew. Return whether there is room."""
         if len(self._known) < _MAX_KNOWN:
             return True
         known = self._known.items()
         ended = [key for key, one in known if one.state.is_final]
-        if not (ended := ended or [key for key, one in known if not one.is_begun]):
+        if not (ended := ended or [key for key, one in known if not one.is_begun or key[0] is Cancel]):
             return False
         del self._known[ended[0]]
         return True
@@ -149,7 +154,7 @@ def robot_place(report: dict[str, Any]) -> RobotPlace:
     if goal is not None:
         text = f"to x {goal['x']:.2f} y {goal['y']:.2f} m for {goal['commander']}: {goal['status']}"
     short = printable(text)[:MAX_ANSWER_LENGTH]
-    if pose is None or map_id is None or max(abs(pose[0]), abs(pose[1])) > MAX_PLACE_M:
+    if pose is None or map_id is None or not all(abs(value) <= MAX_PLACE_M for value in pose[:2]):
         return RobotPlace(None, None, 0.0, 0.0, 0.0, short)
     x, y, yaw = pose
     return RobotPlace(None, map_id, x, y, yaw, short)

@@ -37,6 +37,7 @@ class _CommandConnection:
     def __init__(self, link: socket.socket, name: str) -> None:
         self.link, self.name = link, name
         self.received, self.unsent = b"", b""
+        self.cancel_id = b""  # of its wish to stop the robot
         self.is_watching = self.is_ending = False
 
 
@@ -66,7 +67,7 @@ class CommandServer:
         self._listener.setblocking(False)
 
     def poll(self, goal_id: Callable[[], bytes]) -> list[ev.RobotEvent]:
-        """Return what commanders want; never waits. goal_id: makes the id of a goal."""
+        """Return what commanders want; never waits. goal_id: makes the id of a goal or a cancellation."""
         self._accept()
         events: list[ev.RobotEvent] = []
         for connection in list(self._connections.values()):
@@ -121,9 +122,8 @@ class CommandServer:
                         connection.name, goal_id(), *place, None if map_id is None else str(map_id)
                     )
                 case "cancel":
-                    self._send(connection, {"goal": "cancelled", "is_final": True, "is_reached": True})
-                    connection.is_ending = True
-                    return ev.CancelRequested("`share robot cancel`")
+                    connection.cancel_id = goal_id()
+                    return ev.CancelRequested("`share robot cancel`", connection.cancel_id)
                 case "watch":
                     connection.is_watching = True
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
@@ -133,7 +133,8 @@ class CommandServer:
     def report(self, report: ev.GoalReport) -> None:
         """Tell a commander of its goal, and all that watch."""
         self.notify_watchers({"commander": report.commander, "goal": report.text})
-        connection = self._connections.get(report.commander)
+        by_cancel = (one for one in self._connections.values() if one.cancel_id == report.goal_id != b"")
+        connection = next(by_cancel, self._connections.get(report.commander))
         if connection is not None:
             form = {"goal": report.text, "is_final": report.is_final, "is_reached": report.is_reached}
             self._send(connection, form)

@@ -33,7 +33,7 @@ class DriveRecorder:
                 time_ns = now_ns - (event.age_ns or 0)
                 if event.agent == self._agent and (not self._poses or time_ns > self._poses[-1][0]):
                     self._poses.append((time_ns, event.T_odom_body))
-            case ev.OdometryReceived() if event.T_odom_base.is_finite:
+            case ev.OdometryReceived() if event.problem is None:
                 if not self._wheels or event.stamp_ns > self._wheels[-1][0]:
                     T = event.T_odom_base
                     self._wheels.append((event.stamp_ns, now_ns, T.x, T.y, T.yaw))

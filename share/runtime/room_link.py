@@ -43,6 +43,7 @@ class RoomLink:
         self.numbers = itertools.count(secrets.randbits(40) << 20)
         self._lines = LineLimiter()
         self._news: list[ev.ClientEffect] = []
+        self._trouble: str | None = None
         self._link = connect(address, run_id, keys)
 
     @property
@@ -80,6 +81,9 @@ class RoomLink:
             self.handle(EdgeMessageReceived(frames))
         if (trouble := self._link.trouble()) is not None:
             self._say_new(trouble)
+        if trouble != self._trouble:
+            self._trouble = trouble
+            self.handle(ev.LinkTroubled(trouble or ""))
         self.handle(Tick())
         news, self._news = self._news, []
         return news

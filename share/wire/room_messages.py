@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from numbers import Integral, Real
 
 from share.agent_names import checked_name
 from share.checks import checked_id, checked_map_id, checked_pose
@@ -34,9 +35,32 @@ class Permission(StrEnum):
     OBJECTS = "objects"
 
 
+def no_object_text(object_id: int) -> str:
+    """Return the reason of a `Receipt` for an object that is not there."""
+    return f"there is no object {object_id}"
+
+
 def _check_number(name: str, value: int) -> None:
+    _check_whole(name, value)
     if not 0 <= value <= _MAX_NUMBER:
         raise ValueError(f"{name}: {value} is outside 0 .. {_MAX_NUMBER}")
+
+
+def _check_whole(name: str, value: object) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise ValueError(f"{name}: has to be a whole number (int), not {type(value).__name__}")
+
+
+def _check_object(object_id: int) -> None:
+    _check_whole("object_id", object_id)
+    checked_id("object_id", object_id)
+
+
+def _number(name: str, value: object) -> float:
+    """Raises ValueError for what is no real number, such as text or True."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ValueError(f"{name}: has to be a number, not {type(value).__name__}")
+    return float(value)
 
 
 def _check_map(map_id: str | None) -> None:
@@ -92,7 +116,7 @@ class PutObject:
 
     def __post_init__(self) -> None:
         _check_number("request", self.request)
-        checked_id("object_id", self.object_id)
+        _check_object(self.object_id)
         _check_map(self.map_id)
         T = checked_pose("T_map_object", self.T_map_object, MAX_PLACE_M)
         object.__setattr__(self, "T_map_object", T)
@@ -107,7 +131,7 @@ class RemoveObject:
 
     def __post_init__(self) -> None:
         _check_number("request", self.request)
-        checked_id("object_id", self.object_id)
+        _check_object(self.object_id)
 
 
 @dataclass(frozen=True)
@@ -147,6 +171,8 @@ class Goto:
         _check_number("command", self.command)
         _check_parties(self.robot, self.commander)
         _check_map(self.map_id)
+        for name in ("x", "y") if self.yaw is None else ("x", "y", "yaw"):
+            object.__setattr__(self, name, _number(name, getattr(self, name)))
         _check_place(self.x, self.y, self.yaw)
 
 

@@ -102,18 +102,32 @@ def test_a_commander_that_is_gone_is_told():
         assert served.wait_for(ev.CommanderLost).commander == goal.commander
 
 
-def test_cancel():
-    with Served(lambda server, event: None) as served:
+def _confirm(text: str, is_reached: bool):
+    def answer(server: CommandServer, event: ev.RobotEvent) -> None:
+        if isinstance(event, ev.CancelRequested):
+            server.report(ev.GoalReport(event.commander, text, True, is_reached, event.cancel_id))
+
+    return answer
+
+
+def test_cancel_is_done_when_the_robot_confirms_it():
+    with Served(_confirm("cancelled", True)):
         result = run("cancel")
-        assert (result.exit_code, result.stdout) == (0, "cancelled\n")
-        assert served.wait_for(ev.CancelRequested)
+    assert (result.exit_code, result.stdout) == (0, "cancelled\n")
+
+
+def test_cancel_that_the_robot_does_not_confirm():
+    with Served(_confirm("not confirmed by the robot: stop it by hand", False)):
+        result = run("cancel")
+    assert isinstance(result.exception, ShareError) and result.exit_code == 1
+    assert str(result.exception) == "the robot's stop: not confirmed by the robot: stop it by hand"
 
 
 def test_cancel_that_nobody_answers(monkeypatch):
     monkeypatch.setattr(robot_commands, "ask_bridge", lambda path, wish: iter(()))
     result = run("cancel")
     assert isinstance(result.exception, ShareError)
-    assert str(result.exception) == "the robot was not stopped: the bridge has ended"
+    assert str(result.exception) == "the robot's stop: the bridge has ended"
 
 
 def test_watch_shows_lines_and_where_the_robot_is():

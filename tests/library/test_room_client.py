@@ -104,6 +104,18 @@ def test_what_no_room_has_is_refused_here(server, arguments, text) -> None:
         room.put(*arguments)
 
 
+def test_arguments_of_another_type_are_refused_at_once(server) -> None:
+    with Room(server.address, "ann") as room:
+        with pytest.raises(UsageError, match="object_id: has to be a whole number"):
+            room.remove(7.0)  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match="x: has to be a number, not bool"):
+            room.goto(True, 2.0)
+        for name in ("a/b", 7):
+            with pytest.raises(UsageError):
+                room.stop_robot(name)  # type: ignore[arg-type]
+        room.put("cube", (1, 2, 0))  # and it is still served
+
+
 def test_a_room_that_does_not_let_it_in_says_why() -> None:
     with RoomServer(()) as server, Room(server.address, "ann") as room:
         with pytest.raises(

@@ -175,6 +175,18 @@ def test_a_removal_that_the_dead_edge_had_done_counts_as_done(bench) -> None:
     assert answers(bench, bench.ann)[2] == ""
 
 
+def test_a_removal_that_is_refused_after_a_restart_is_not_done(bench) -> None:
+    bench.put(bench.bob, 1, 7, at(1, 2), MAP)
+    bench.run(0.1)
+    bench.rights["ann"] = frozenset()
+    bench.to_client(bench.ann, ev.MessageWanted(room.RemoveObject(2, 7)))
+    bench.pass_on()  # to an edge that dies before it answers
+    bench.restart_edge()
+    bench.run(5)
+    assert "nobody may place objects here" in answers(bench, bench.ann)[2]
+    assert 7 in positions(bench, bench.bob)
+
+
 def test_a_client_that_was_away_sees_what_there_is(bench) -> None:
     bench.put(bench.ann, 1, 7, at(1, 2), MAP)
     bench.put(bench.ann, 2, 8, at(1, 2), MAP)

@@ -1,6 +1,8 @@
 """The robot bridge: map → odom at the pose's own time, and what stops the robot."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from share.robot import robot_events as ev
 from share.robot.bridge import LEAD_S
 from share.robot.planar import PlanarPose, flattened
 from share.robot.settings import DrivingArea, RobotSettings
+from share.robot.wire_commands import robot_place
+from share.runtime.robot_drive import DriveRecorder
 from share.types import TrackState
 
 
@@ -154,6 +158,35 @@ def test_without_a_place_the_robot_stops_and_tf_too(drive: RobotDrive, fault, te
     drive.goals = []
     drive.goto()
     assert drive.last_report.is_final and "refused" in drive.last_report.text
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"T_odom_base": PlanarPose(1.7e308, -1.7e308, -0.48)}, "more than 100 km off"),
+        ({"T_odom_base": PlanarPose(1e154, 0.0, 0.0)}, "more than 100 km off"),
+        ({"T_odom_base": PlanarPose(0.0, 0.0, -1.7e308)}, "yaw of more than 1e+06 rad"),
+        ({"speed_m_s": math.nan}, "not finite"),
+        ({"speed_m_s": -1e300}, "more than 100 km off"),
+        ({"stamp_ns": 10**40}, "a time of no clock"),
+        ({"stamp_ns": -(10**40)}, "a time of no clock"),
+    ],
+)
+def test_odometry_that_no_robot_has_stops_it(drive: RobotDrive, changed: dict[str, Any], text: str) -> None:
+    under_way(drive)
+    drive.is_driven = False
+    wrong = replace(drive.odometry(), **changed)
+    recorder = DriveRecorder(None)
+    recorder.add(wrong, drive.now_ns)
+    assert ", 0 of odometry," in recorder.text  # nor is it for a calibration
+    drive.handle(wrong)
+    drive.run(0.1)
+    assert stopped_for(drive, text)
+    place = robot_place(drive.bridge.report(drive.now_ns))
+    assert place.map_id is None
+    drive.is_driven = True
+    drive.run(1.0)
+    assert drive.bridge.report(drive.now_ns)["fault"] is None
 
 
 def test_what_comes_back_is_published_again_but_no_goal_goes_on(drive: RobotDrive) -> None:

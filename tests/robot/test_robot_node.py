@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import importlib.util
 import json
@@ -9,7 +10,10 @@ import os
 import secrets
 import subprocess
 import sys
+import threading
 import time
+import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,6 +21,7 @@ import numpy as np
 import pytest
 import zmq
 from click.testing import CliRunner
+from helpers.raw_zmtp import RawPeer, message, parts
 from helpers.ros_bench import (
     ROS,
     RosRoom,
@@ -30,6 +35,7 @@ from helpers.ros_bench import (
 from share.cli.main import cli
 from share.errors import TransportError, UsageError
 from share.net.keys import generate_pair
+from share.net.tcp import resident_bytes
 from share.robot import robot_events as ev
 from share.robot import share_robot_node as robot_node
 from share.robot.node_link import NodeKeys, NodeLink, node_events
@@ -218,6 +224,40 @@ def test_a_node_that_is_silent_is_gone_and_the_next_is_heard(link: NodeLink, pri
         assert node.run(foreign="map")
 
 
+STALE = b'{"version": 1, "at": 1, "seen": null}'
+
+
+@pytest.mark.parametrize(
+    ("flood", "is_endless"),
+    [(parts(1000, b"x" * 60_000), True), (parts(200_000), True), (message(STALE) * 500, False)],
+    ids=["message without end", "empty parts without end", "small messages"],
+)
+def test_a_flood_at_the_port_takes_no_memory_and_the_node_is_heard(
+    link: NodeLink, printed: list[str], flood: bytes, is_endless: bool
+) -> None:
+    with FakeNode(link) as node, RawPeer.joined(link.endpoint, b"evil") as evil:
+        assert node.run(foreign="map")
+        ends: list[float] = []
+
+        def send() -> None:
+            end = time.monotonic() + 4
+            while time.monotonic() < end and evil.send(flood):
+                pass
+            ends.append(end - time.monotonic())
+
+        before = resident_bytes()
+        thread = threading.Thread(target=send)
+        thread.start()
+        heard, most = 0, 0
+        while thread.is_alive():
+            heard += len(node.run(0.1, foreign="map"))
+            most = max(most, resident_bytes() - before)
+        thread.join()
+        assert heard and most < 100_000_000
+        if is_endless:
+            assert ends[0] > 0 and "disconnected" in printed[1]
+
+
 def test_the_right_key_enters_and_no_other(tmp_path: Path, printed: list[str]) -> None:
     keys = keys_at(tmp_path)
     robot = (tmp_path / "robot" / "robot.secret").read_text().split()[2]
@@ -288,6 +328,80 @@ def test_bad_words(tmp_path: Path, monkeypatch, capsys, words: list[str], text: 
     with pytest.raises(SystemExit) as ended:
         robot_node.main()
     assert ended.value.code == 2 and text in capsys.readouterr().err
+
+
+class _Topics(robot_node.RobotTopics):
+    """The node's topics without rclpy, which remember what is cancelled."""
+
+    def __init__(self) -> None:
+        self.node = self
+        self.outgoing, self.under_way, self.cancelled = deque(), [], []  # type: ignore[var-annotated]
+        self.lines: list[str] = []
+
+    def get_logger(self) -> _Topics:
+        return self
+
+    def _log(self, text: str, **_: object) -> None:
+        self.lines.append(text)
+
+    info = warning = error = _log
+
+    def cancel(self, goal_id: str) -> None:
+        self.cancelled.append(goal_id)
+
+
+def _bomb() -> str:
+    """A map of 1 GB in 1.4 MB."""
+    packer = zlib.compressobj(1)
+    data = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1 << 6)) + packer.flush()
+    fixed = {"size": [1 << 13, 1 << 13], "cells": base64.b64encode(data).decode()}
+    return json.dumps({**fixed, "resolution": 1, "origin": [0, 0, 0], "body": [0] * 7, "name": "x"})
+
+
+def test_what_no_bridge_sends_does_not_end_the_nodes_link(monkeypatch) -> None:
+    monkeypatch.setattr(robot_node, "zmq", zmq, raising=False)
+    topics, bridge = _Topics(), Freshness(5)
+    socket = zmq.Context.instance().socket(zmq.ROUTER)
+    port = socket.bind_to_random_port("tcp://127.0.0.1")
+    link = robot_node.BridgeLink(topics, f"tcp://127.0.0.1:{port}", None)
+    bomb = _bomb()
+    link.start()
+    bodies = [
+        "[" * 100_000,
+        '{"version": 1, "x": ' + "[" * 100_000 + "]" * 100_000 + "}",
+        "\udcff{",
+        '"goal": 5',
+        '"speed": ' + "9" * 5000,
+        '"speed": ' + "9" * 400,
+        '"fixed": ' + bomb,
+        '"fixed": {"size": [-1, 5], "cells": ""}',
+        '"cancel": []',
+    ]
+    try:
+        name = b""
+        for body in bodies:
+            while socket.poll(0) or not name:
+                name, data = socket.recv_multipart()
+                bridge.take(json.loads(data), time.monotonic_ns())
+            told = bridge.stamped({"version": VERSION}, time.monotonic_ns()).decode()
+            text = f"{told[:-1]}, {body}}}" if body.startswith('"') else body
+            socket.send_multipart([name, told.encode()])
+            socket.send_multipart([name, text.encode("utf-8", "surrogateescape")])
+            time.sleep(0.15)
+        assert link.is_alive()
+        topics.under_way = [GOAL.hex()]
+        end = time.monotonic() + 20
+        while len(topics.cancelled) < 2 and time.monotonic() < end:  # nothing comes any more
+            time.sleep(0.05)
+        assert topics.cancelled[-1] == GOAL.hex() and link.is_alive()
+        nonsense = [line for line in topics.lines if "is not understood" in line]
+        assert len(nonsense) == len(bodies) - 1 and any("a map of 8192 by 8192" in line for line in nonsense)
+    finally:
+        link.is_ended = True
+        link.join()
+        link._socket.close()
+        link._socket.context.term()
+        socket.close(0)
 
 
 # ------------------------------------------------------------ with a robot of rclpy

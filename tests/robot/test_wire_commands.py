@@ -10,11 +10,14 @@ from helpers.robot_drive import RobotDrive
 from helpers.room_bench import Air, RoomBench, at
 
 from share.protocol import room_events as ce
+from share.protocol.command_service import GONE_S
+from share.protocol.common_events import EdgeMessageReceived, PrintLine
 from share.robot import robot_events as ev
 from share.robot.goal_control import GOAL_PREFIX
 from share.robot.settings import RobotSettings
 from share.robot.wire_commands import LEASE_S, WireCommands
 from share.wire import room_messages as room
+from share.wire.codec import encode
 from share.wire.room_messages import Permission
 
 MAP, BOT = "ann-1/0", b"\0\0\0\0\0\0\0\x15"
@@ -29,15 +32,17 @@ class WiredRobot:
         self.taken, self.goals = 0, 0
         self.bench.correct(self.bench.agent("ann", 1), MAP, np.eye(4))
         self.bench.client("bot", 21, drives_robot=True)
-        self.is_bridge_alive, self.is_navigating = True, True
+        self.is_bridge_alive = self.is_navigating = self.is_confirming = True
         self.accepted: list[bytes] = []  # goals that the robot's navigation has
         self.run(0.5)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
             self.bench.run(0.02)
-            self.drive.run(0.02)
+            effects = self.drive.run(0.02)
             if self.is_bridge_alive:
+                for effect in effects:
+                    self._take(effect)
                 self._serve()
 
     def _serve(self) -> None:
@@ -77,7 +82,9 @@ class WiredRobot:
 
     def _navigate(self) -> None:
         """Nav2 accepts what it is sent, and cancels what it is asked to."""
-        cancelled = {one.goal_id for one in self.drive.of(ev.CancelGoal)}
+        if not self.is_navigating:
+            return
+        cancelled = {one.goal_id for one in self.drive.of(ev.CancelGoal)} if self.is_confirming else set()
         goals = tuple(
             (goal, ev.GoalStatus.CANCELED if goal in cancelled else ev.GoalStatus.EXECUTING)
             for goal in self.accepted
@@ -435,3 +442,188 @@ def test_goals_that_are_not_confirmed_leave_room_for_others(robot) -> None:
     robot.goto(robot.commander("ann", 31), 1)
     robot.run(1)
     assert robot.has_goal
+
+
+def test_a_cancel_is_done_once_the_robot_confirms_it(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    robot.cancel(eve, 1)
+    robot.run(0.5)
+    assert robot.last(eve, 1).text == "no goal is under way" and robot.last(eve, 1).is_reached
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_confirming = False
+    robot.cancel(eve, 2)
+    robot.run(2)
+    assert not robot.last(eve, 2).is_final and robot.has_goal
+    robot.is_confirming = True
+    robot.run(0.3)
+    assert robot.last(eve, 2) == room.CommandState(2, "bot", "eve", "cancelled", True, True)
+    assert not robot.has_goal and robot.bench.clients[eve].is_idle
+
+
+def test_a_cancel_that_the_robot_does_not_confirm_says_so(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_confirming = False
+    robot.cancel(eve, 1)
+    robot.run(4)
+    text = "not confirmed by the robot: stop it by hand"
+    assert robot.last(eve, 1) == room.CommandState(1, "bot", "eve", text, True, False)
+    robot.cancel(eve, 2)  # one more is answered at once
+    robot.run(0.3)
+    assert robot.last(eve, 2).text == text and not robot.last(eve, 2).is_reached
+    assert robot.has_goal and robot.drive.of(ev.CancelGoal)
+
+
+def test_what_a_cancel_cannot_stop_is_said(robot) -> None:
+    eve, goal = robot.commander("eve", 32), bytes(16)
+    robot.is_navigating = False
+    for command, (driving, text) in enumerate(
+        [
+            (goal, "another program has sent the robot a goal; cancel it there"),
+            (
+                GOAL_PREFIX + goal[:8],
+                "a goal that nobody follows is being cancelled; not confirmed by the robot",
+            ),
+        ]
+    ):
+        robot.handle(ev.StatusReceived(((driving, ev.GoalStatus.EXECUTING),)))
+        robot.cancel(eve, command)
+        robot.run(0.3)
+        assert robot.last(eve, command).text.startswith(text)
+        assert robot.last(eve, command).is_final and not robot.last(eve, command).is_reached
+
+
+def test_a_flood_of_cancels_ends_and_holds_no_memory(robot) -> None:
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.is_confirming = False
+    for command in range(200):
+        robot.bench.said(eve, room.Cancel(command, "bot"))
+        robot.run(0.02)
+    assert len(robot.commands._known) <= 64
+    robot.cancel(eve, 500)
+    robot.run(4)
+    assert robot.last(eve, 500).is_final
+
+
+def test_another_bridge_cannot_answer_a_commander_that_watches_robots(robot) -> None:
+    ann = robot.bench.client("ann", 31, wants_robots=True)
+    evil = robot.bench.client("evil", 66, drives_robot=True, wants_robots=True)
+    robot.bench.said(evil, room.CommandState(1, None, "ann", "reached", True, True))  # before its time
+    robot.run(0.1)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.bench.said(evil, room.CommandState(1, None, "ann", "reached", True, True))
+    robot.bench.said(evil, room.CommandState(7, None, "bob", "reached", True, True))
+    robot.run(4)
+    assert robot.has_goal and not robot.bench.clients[ann].is_idle
+    assert {one.state.robot for one in robot.bench.of(ann, ce.CommandChanged)} == {"bot"}
+    robot.bench.said(evil, room.CommandState(2, None, "ann", "stopped: nothing", True))
+    robot.cancel(ann, 2)
+    robot.run(0.5)
+    assert robot.last(ann, 2).text == "cancelled" and not robot.has_goal
+
+
+def test_a_goal_for_the_only_robot_stays_its_own_where_an_evil_one_comes(robot) -> None:
+    ann = robot.bench.client("ann", 31, wants_robots=True)
+    robot.run(0.1)
+    robot.goto(ann, 77, robot=None)
+    robot.bench.run(0.1)  # passed on; the bridge has not answered
+    evil = robot.bench.client("evil", 66, drives_robot=True, wants_robots=True)
+    robot.bench.run(0.1)
+    robot.bench.said(evil, room.CommandState(77, None, "ann", "1.20 m to go"))
+    robot.run(1.5)
+    assert robot.has_goal and not robot.bench.of(evil, ce.RobotCommanded)
+    assert {one.state.robot for one in robot.bench.of(ann, ce.CommandChanged)} == {"bot"}
+
+
+@pytest.mark.parametrize("robot_name", ["bot", None])
+def test_an_edge_that_answers_for_another_robot_is_not_believed(robot, robot_name) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1, robot=robot_name)
+    robot.run(1)
+    forged = room.CommandState(1, "nobody", "ann", "reached", True, True)
+    robot.bench.to_client(ann, EdgeMessageReceived(encode(forged)))
+    robot.run(1)
+    assert robot.has_goal and robot.last(ann, 1).text == "executing"
+    lines = [one.text for one in robot.bench.of(ann, PrintLine) if "nobody" in one.text]
+    assert lines == ["robot 'nobody' answers for 'bot'; ignored"]
+
+
+def test_who_may_nothing_cannot_hide_what_others_command(robot) -> None:
+    robot.bench.rights["eve"] = frozenset()
+    ann, eve = robot.commander("ann", 31), robot.commander("eve", 32)
+    for command in range(300):
+        robot.bench.said(eve, room.Cancel(command, "bot"))
+        robot.run(0.1)
+    for command in range(3):
+        robot.goto(ann, 2 * command, x=2.0 + command)
+        robot.run(0.5)
+        robot.cancel(ann, 2 * command + 1)
+        robot.run(0.5)
+    said = [line for line in robot.bench.reasons("robot commanded") if line.startswith("'ann' ")]
+    assert len(said) == 6
+    answered = [line for line in robot.bench.reasons("robot answered") if "sent by 'ann'" in line]
+    assert len(answered) == 6
+    assert len(robot.bench.reasons("robot commanded")) < 100  # of eve's 300
+
+
+def test_a_goal_ends_where_the_bridge_is_gone_for_good(robot) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1)
+    robot.run(1)
+    del robot.bench.clients[BOT]
+    robot.is_bridge_alive = False
+    robot.run(3.5 + GONE_S - 1)
+    assert robot.last(ann, 1).text == "robot 'bot' is not connected" and not robot.last(ann, 1).is_final
+    robot.run(2)
+    text = "given up: robot 'bot' has not been connected for 10 s; give the goal again"
+    assert robot.last(ann, 1) == room.CommandState(1, "bot", "ann", text, True, False)
+    assert robot.bench.clients[ann].is_idle
+
+
+def test_a_commander_whose_link_is_refused_reads_why(robot) -> None:
+    ann = robot.commander("ann", 31)
+    robot.goto(ann, 1)
+    robot.run(1)
+    robot.bench.air.loss = 1.0
+    robot.bench.to_client(ann, ce.LinkTroubled("refused: its key is not authorized\x1b" + "x" * 300))
+    robot.run(11)
+    state = robot.last(ann, 1)
+    assert state.is_final and state.text.startswith("no edge answers: refused: its key is not authorized")
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "text"),
+    [
+        (room.RemoveObject, (1, 7.0), "object_id: has to be a whole number"),
+        (room.RemoveObject, (True, 7), "request: has to be a whole number"),
+        (room.Goto, (1, "bot", "", None, True, 2.0), "x: has to be a number, not bool"),
+        (room.Goto, (1, "bot", "", None, 1.0, "2"), "y: has to be a number, not str"),
+        (room.Goto, (1, "bot", "", None, 1.0, 2.0, 1j), "yaw: has to be a number, not complex"),
+        (room.Cancel, (1.0, "bot"), "command: has to be a whole number"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused_by_its_type(kind, arguments, text) -> None:
+    with pytest.raises(ValueError, match=text):
+        kind(*arguments)
+
+
+def test_other_real_numbers_are_sent_as_floats() -> None:
+    goal = room.Goto(1, "bot", "", None, np.float32(1.5), np.int64(2), np.float64(0.5))
+    assert room.RemoveObject(np.int64(1), np.int32(7)).object_id == 7
+    assert encode(goal) == encode(room.Goto(1, "bot", "", None, 1.5, 2.0, 0.5))
+
+
+def test_a_message_that_cannot_be_encoded_costs_itself_only(robot) -> None:
+    ann = robot.commander("ann", 31)
+    wrong = room.Goto(1, "bot", "", None, 1.0, 2.0)
+    object.__setattr__(wrong, "x", object())
+    with pytest.raises(AttributeError):
+        robot.bench.to_client(ann, ce.MessageWanted(wrong))
+    robot.goto(ann, 2)
+    robot.run(1)
+    assert robot.last(ann, 2).text == "executing" and robot.bench.clients[ann].is_connected
