@@ -56,6 +56,7 @@ def stack() -> Iterator[ExitStack]:
 
 def test_two_wearers_share_a_marker(stack, tmp_path, monkeypatch) -> None:
     from helpers.headset_client import code
+
     from share.headset.wearers import EdgeAccess
 
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
