@@ -199,8 +199,8 @@ class ConnectionGuard:
                 self._remove(value)
             elif self._expected_failures:
                 self._expected_failures -= 1
-            elif not any(connection.is_held for connection in self._connections.values()):
-                with self._lock:  # handshakes of held connections may time out
+            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:  # else its peer left, or never answered
+                with self._lock:
                     self._failed_handshakes += 1
 
     def _accept(self, descriptor: int) -> None:
