@@ -88,6 +88,7 @@ class ConnectionGuard:
         self._agent_addresses: set[str] = set()  # from which a key has sent a message
         self._resident_bytes = tcp.resident_bytes()  # memory of this process when little waited last
         self._delivered_bytes = 0  # since then: the receiver may still hold them
+        self.expects_growth = False  # this process grows by itself: no peer is blamed for it
         self._marked_s = 0.0
         self._messages_since_mark = 0
         self._thread = Thread(target=self._run, name="guard", daemon=True)
@@ -199,8 +200,8 @@ class ConnectionGuard:
                 self._remove(value)
             elif self._expected_failures:
                 self._expected_failures -= 1
-            elif not any(connection.is_held for connection in self._connections.values()):
-                with self._lock:  # handshakes of held connections may time out
+            elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:  # else its peer left, or never answered
+                with self._lock:
                     self._failed_handshakes += 1
 
     def _accept(self, descriptor: int) -> None:
@@ -269,7 +270,9 @@ class ConnectionGuard:
         self._enforce_limits(now_s)
         self._gate.record_empty(empty_s)
         waiting_bytes = sum(max(0, c.backlog.waiting_bytes) for c in self._live_connections())
-        if waiting_bytes > self._limits.message_bytes:
+        if self.expects_growth:
+            self._resident_bytes, self._delivered_bytes = tcp.resident_bytes(), 0
+        elif waiting_bytes > self._limits.message_bytes:
             self._check_memory_growth(waiting_bytes, now_s)
         self._release_waiting(now_s)
         if waiting_bytes <= self._limits.message_bytes and not self._gate.is_discarding_any:

@@ -94,6 +94,10 @@ class EdgeLink(Protocol):
         """Return why no agent can connect now; None if all is well."""
         ...
 
+    def expect_growth(self, is_expected: bool) -> None:
+        """Set whether this process grows by itself, as while it loads a map: no peer is blamed for it."""
+        ...
+
     def wake(self) -> None:
         """See `AgentLink.wake`."""
         ...

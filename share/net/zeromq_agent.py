@@ -7,6 +7,7 @@ libzmq holds what it has received and not yet delivered; the guard bounds that w
 from __future__ import annotations
 
 import contextlib
+import errno
 import time
 from collections.abc import Iterator, Sequence
 
@@ -60,6 +61,7 @@ class ZmqAgentLink:
         self._reconnect_s: float | None = None  # monotonic time of the next attempt
         self._flood_trouble_until_s = 0.0  # monotonic time at which `_flood_trouble` ends
         self._has_connected = False  # since the last `poll_connected`
+        self._early_ends = 0  # of connections by the edge, within their handshakes, one after the other
         self._open()
         try:
             self._link.socket.connect(str(self._target))
@@ -145,11 +147,11 @@ class ZmqAgentLink:
                 self._guard.set_connection(value, time.monotonic())
             elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._reconnect_s = self._trouble = None
-                self._has_connected = True
+                self._has_connected, self._early_ends = True, 0
                 self._flood_trouble_until_s = time.monotonic() + _FLOOD_TROUBLE_S
             else:
                 self._reconnect_s = time.monotonic() + _RECONNECT_S
-                if event != zmq.EVENT_DISCONNECTED:
+                if event != zmq.EVENT_DISCONNECTED and self._is_refusal(event, value):
                     self._trouble = f"refused: {self._reason(event)}"
         if self._reconnect_s is not None and time.monotonic() >= self._reconnect_s:
             self._reconnect_s = None
@@ -162,6 +164,14 @@ class ZmqAgentLink:
             while True:
                 message = recv_monitor_message(self._events, zmq.NOBLOCK)
                 yield message["event"], message["value"]
+
+    def _is_refusal(self, failure: int, error: int) -> bool:
+        """Return whether a handshake failed because the edge does not want it. A paused edge does not answer;
+        one that stops ends a connection once."""
+        if failure != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
+            return True
+        self._early_ends = 0 if error == errno.EAGAIN else self._early_ends + 1
+        return self._early_ends > 1
 
     def _reason(self, failure: int) -> str:
         if self._keys is None:

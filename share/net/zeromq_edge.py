@@ -71,6 +71,7 @@ class ZmqEdgeLink:
         self._agent_names: dict[str, frozenset[str]] = {}  # by key, since the last refresh of the list
         self._list_due_s = 0.0
         self._list_trouble: str | None = None
+        self._expects_growth = False
         self.discarded_messages = 0  # from peers that are no agents or were disconnected
         self._open()
 
@@ -156,6 +157,9 @@ class ZmqEdgeLink:
         lines = ["an agent without keys, or with another edge's key: check its --server-key"] * failed
         return reports + lines + self._authenticator.refusals()
 
+    def expect_growth(self, is_expected: bool) -> None:
+        self._expects_growth = self._guard.expects_growth = is_expected
+
     def wake(self) -> None:
         self._link.wake()
 
@@ -168,6 +172,7 @@ class ZmqEdgeLink:
         self._guard = ConnectionGuard(
             socket, self._bounds, self._blocklist, partial(self._link.wake, _GUARD_WAKE)
         )
+        self._guard.expects_growth = self._expects_growth
         self._authenticator = None
         if self._keys is not None:
             self._authenticator = ZapAuthenticator(self._link.context, socket, self._keys, self._guard)

@@ -73,6 +73,8 @@ LIMITS = {
 _CLOCK_ERROR_MS = 10.0
 _CLOCK_GRACE_S = 10.0  # after joining; an estimate needs some exchanges
 _UNACKNOWLEDGED_MS = 5000.0
+SILENT = "SILENT"  # an agent's state where it has sent nothing for a while
+MISSED_S = 60.0  # for which an agent that went without a bye is trouble
 
 
 def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) -> list[str]:
@@ -82,7 +84,7 @@ def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) 
     """
     limits, state = LIMITS[kind], report["state"]
     out = []
-    if state in (TrackState.LOST, "SILENT"):
+    if is_lost(report):
         out.append(f"{state}: {report['reason']}" if report["reason"] else state)
     for what, ms, limit_ms in (
         ("poses come", report["pose_ms"], limits.pose_ms),
@@ -100,6 +102,16 @@ def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) 
     if report["unacknowledged_ms"] > _UNACKNOWLEDGED_MS:
         out.append(f"a keyframe has waited {report['unacknowledged_ms'] / 1e3:.0f} s to be acknowledged")
     return out
+
+
+def is_lost(report: Mapping[str, Any]) -> bool:
+    """Return whether an agent with this entry in edge.json has no current pose, or sends none."""
+    return report.get("state") in (TrackState.LOST, SILENT)
+
+
+def has_left(report: Mapping[str, Any]) -> bool:
+    """Return whether an agent is gone and not missed: it said bye, or has been silent for long."""
+    return bool(report.get("gone")) and not report.get("trouble")
 
 
 def trouble_lines(agents: Mapping[str, Mapping[str, Any]]) -> list[str]:

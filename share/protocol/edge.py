@@ -278,8 +278,9 @@ class EdgeProtocol:
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         """Return the report of a run without what the mapper knows of it."""
-        name = peer.name if self._registry.is_latest(peer) else None
-        return peer.report(self._out.now_ns, self._rate_scheduler.report(name, peer.hello.kind))
+        is_latest = self._registry.is_latest(peer)
+        rating = self._rate_scheduler.report(peer.name if is_latest else None, peer.hello.kind)
+        return peer.report(self._out.now_ns, rating, is_latest)
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, whose `agents` are by run key. Runs

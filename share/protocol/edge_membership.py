@@ -88,6 +88,7 @@ class RoomMembership:
         for other in self._registry.present() if displaced else ():
             if other.name in displaced:
                 self.refuse(other.id, f"no air left beside headsets: '{peer.name}' has joined")
+                other.status.leave()  # it was sent away: nobody misses it
                 self.mark_gone(other, "left", f"made room for '{peer.name}'")
 
     def _join(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:

@@ -13,7 +13,7 @@ from share.geometry import se3
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredMap, map_poses
-from share.protocol.agent_health import PoseAges, agent_troubles
+from share.protocol.agent_health import MISSED_S, SILENT, PoseAges, agent_troubles
 from share.protocol.correction_delay import ComputationDelay
 from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer
 from share.scheduling.room_budget import RateGrant
@@ -22,7 +22,6 @@ from share.types import TrackState
 from share.wire.messages import Hello, PoseUpdate, Status, peer_id
 
 SILENT_S = 0.7  # agents report twice a second; after this the last report is no longer shown as the state
-SILENT = "SILENT"
 
 
 class PeerStatus:
@@ -58,7 +57,11 @@ class PeerStatus:
         """Record a bye: silence is expected from now on."""
         self._has_left = True
 
-    def report(self, now_ns: int, last_received_ns: int | None) -> dict[str, Any]:
+    def is_missed(self, now_ns: int, last_received_ns: int) -> bool:
+        """Return whether an agent that is gone went without a bye, not long ago."""
+        return not self._has_left and now_ns - last_received_ns <= seconds_to_ns(MISSED_S)
+
+    def report(self, now_ns: int, last_received_ns: int | None, is_gone: bool = False) -> dict[str, Any]:
         """Return plain data. state: SILENT without a message for SILENT_S. pose_age_ms: None if never
         reported. last_received_ns: time of the last message; None: none in this session."""
         if last_received_ns is None:
@@ -68,7 +71,9 @@ class PeerStatus:
         silent_ns = max(0, now_ns - last_received_ns)
         since_ms = max(0, now_ns - self._age_at_ns) / 1e6
         silent = silent_ns > seconds_to_ns(SILENT_S) and not self._has_left
-        reason = f"silent for {silent_ns / SECOND_NS:.1f} s; its last state was {self.state}"
+        is_missed = not is_gone or self.is_missed(now_ns, last_received_ns)
+        how_long = f"silent for {silent_ns / SECOND_NS:.1f} s" if is_missed else "gone without a word"
+        reason = f"{how_long}; its last state was {self.state}"
         return {
             "state": SILENT if silent else str(self.state),
             "reason": reason if silent else self._reason,
@@ -190,9 +195,10 @@ class Peer(Sender):
         self.status.add_pose(pose.state, now_ns, pose.age_ms)
         self.latest_pose = pose
 
-    def report(self, now_ns: int, rating: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the fields of edge.json that come from the run's messages. rating: of `RateScheduler`."""
-        status = self.status.report(now_ns, self.last_received_ns if self.has_sent else None)
+    def report(self, now_ns: int, rating: Mapping[str, Any], is_latest: bool = True) -> dict[str, Any]:
+        """Return the fields of edge.json that come from the run's messages. rating: of `RateScheduler`.
+        is_latest: of its name; no other run is missed."""
+        status = self.status.report(now_ns, self.last_received_ns if self.has_sent else None, self.is_gone)
         if self.overload.is_recent(now_ns, _OVERLOAD_SHOWN_S):
             status["reason"] = "; ".join(filter(None, (status["reason"], self.overload.reason)))
         report = {
@@ -208,9 +214,11 @@ class Peer(Sender):
             "last_suspicion": self.suspect_keyframes.reason or None,
             **rating,
         }
-        joined_s = 0.0 if self.joined_ns is None else (now_ns - self.joined_ns) * 1e-9
-        troubles = [] if self.is_gone else agent_troubles(self.hello.kind, report, joined_s)
-        return report | {"trouble": troubles}
+        if not self.is_gone:
+            joined_s = 0.0 if self.joined_ns is None else (now_ns - self.joined_ns) * 1e-9
+            return report | {"trouble": agent_troubles(self.hello.kind, report, joined_s)}
+        is_missed = is_latest and self.has_sent and self.status.is_missed(now_ns, self.last_received_ns)
+        return report | {"trouble": [f"{SILENT}: {report['reason']}"] if is_missed else []}
 
 
 def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list[str]:

@@ -225,6 +225,7 @@ class EdgeRun:
             )
         else:
             self._start_mapping(*loaded, start_delay_s)
+        self._link.expect_growth(loaded[0] is not None)  # until the mapper has it
         store = self._restarts.store
         self._observer.begin_session(None if store is None else store.path, loaded[1])
 
@@ -295,6 +296,7 @@ class EdgeRun:
                     self._log_event(notice.event, notice.text)
                 case MapRestored():
                     self._restarts.record_restored()
+                    self._link.expect_growth(False)
                 case SolverDied() as solver:
                     self._log_event("solver died", solver.text)
                     self._troubles.add(f"the solver: {solver.text}")

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from share.protocol.agent_health import has_left
+
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
@@ -146,7 +148,16 @@ def render_metrics(report: dict[str, Any]) -> tuple[bytes, str]:
     from prometheus_client.exposition import choose_encoder
 
     encode, media_type = choose_encoder("")
-    return encode(_Collector(report)), media_type
+    agents = {label: _without_the_past(agent) for label, agent in _entries(report, "agents")}
+    return encode(_Collector({**report, "agents": agents})), media_type
+
+
+def _without_the_past(agent: Any) -> Any:
+    """Return an agent's entry; of one that has left without the age and state that it had: an alert on them
+    would never end."""
+    if not isinstance(agent, dict) or not has_left(agent):
+        return agent
+    return {**agent, "state": "GONE", "pose_age_ms": None}
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,8 @@ function shape(tag, attributes, content) {
 function planOfMap(id, agents) {
   const paths = entries(agents).flatMap(([name, a]) =>
     a.parts.filter(p => p.map_id === id && p.path.length).map(p => ({name, path: p.path})));
-  const here = entries(agents).filter(([, a]) => a.map_id === id && a.position);
+  const here = entries(agents).filter(([n, a]) =>
+    a.map_id === id && a.position && !hasLeft(reported[n] ?? {}));
   const all = [...paths.flatMap(p => p.path), ...here.map(([, a]) => a.position)];
   if (!all.length) return null;
   const bound = (k, of) => all.reduce((best, p) => of(best, p[k]), all[0][k]);
@@ -162,10 +163,12 @@ function planOfMap(id, agents) {
     const [x, y] = [X(a.position[0]), Y(a.position[1])];
     const turn = `translate(${x} ${y}) rotate(${-a.heading * 180 / Math.PI}) scale(${unit})`;
     const outline = {fill: "none", stroke: colour(name), "stroke-width": .3};
-    svg.append(shape("path", {transform: turn, ...a.kind === "robot"
+    const lost = isLost(reported[name] ?? {});
+    svg.append(shape("path", {transform: turn, opacity: lost ? .5 : 1, ...a.kind === "robot"
       ? {d: "M1 0A1 1 0 1 1 1 -.01M0 0H1", ...outline}
-      : {d: "M0 0L1.6 -.9V.9Z", fill: colour(name)}}));
-    svg.append(shape("text", {x: x + unit, y: y - unit, "font-size": 1.8 * unit}, name));
+      : {d: "M0 0L1.6 -.9V.9Z", ...lost ? outline : {fill: colour(name)}}}));
+    const label = lost ? `${name}: ${reported[name].state}` : name;
+    svg.append(shape("text", {x: x + unit, y: y - unit, "font-size": 1.8 * unit}, label));
   }
   const figure = document.createElement("figure");
   const who = here.map(([name]) => name).join(", ") || "nobody now";
@@ -179,8 +182,10 @@ function showPlan(plan) {
   at("plan").replaceChildren(...(figures.length ? figures : [node("span", "no path yet", "none")]));
 }
 
-const isLost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
-const isStale = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
+let reported = {};  // agents of the newest report
+const hasLeft = a => a.gone && !a.trouble?.length;  // else it went without a bye, not long ago
+const isLost = a => !hasLeft(a) && ["LOST", "SILENT"].includes(a.state);
+const isStale = a => !hasLeft(a) && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
 const age = ms => typeof ms !== "number" ? "–"
   : ms < 1000 ? `${fixed(ms, 0)} ms` : `${fixed(ms / 1000, 1)} s`;
 
@@ -223,12 +228,13 @@ function named(name) {
 
 function show(now) {
   updateRates(now);
+  reported = now.agents ?? {};
   Object.keys(now.agents ?? {}).forEach(colour);  // in the order in which they came, as in the live room
   const trouble = [...now.trouble ?? [], ...now.agent_trouble ?? []];
   const count = matches => entries(now.agents).filter(([, a]) => matches(a)).length;
   const agentCount = n => `${n} agent${n === 1 ? "" : "s"}`;
   const stale = count(a => isLost(a) || isStale(a));
-  const quarantined = count(a => !a.gone && isQuarantined(a));
+  const quarantined = count(a => !hasLeft(a) && isQuarantined(a));
   const degraded = now.degraded ?? [];
   const warnings = degraded.length ? ["degraded"] : [];
   if (stale) warnings.push(`${agentCount(stale)} without a current pose`);
@@ -243,21 +249,21 @@ function show(now) {
   const port = now.live_room?.split(":").pop();
   if (port) at("room").href = `${location.protocol}//${location.hostname}:${port}/`;
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
-  const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
+  const agents = entries(now.agents).sort(([a, x], [b, y]) => hasLeft(x) - hasLeft(y) || (a < b ? -1 : 1));
   table("agents",
     ["name", "state", "pose age", "reason", "kind", "poses come after", "QoE (target)", "delay",
      "keyframes", "rate", "corrections", "map", "kB/s", "loops"],
-    agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      named(name), node("td", a.gone ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
-      node("td", a.gone ? "–" : age(a.pose_age_ms), isStale(a) ? "bad" : ""),
+    agents.map(([name, a]) => ({kind: hasLeft(a) ? "gone" : "", cells: [
+      named(name), node("td", hasLeft(a) ? "gone" : text(a.state), isLost(a) ? "bad" : ""),
+      node("td", hasLeft(a) ? "–" : age(a.pose_age_ms), isStale(a) ? "bad" : ""),
       a.reason, a.kind, a.gone ? "–" : age(a.pose_ms),
       Number.isFinite(a.qoe) ? `${fixed(a.qoe, 2)} (${fixed(a.qoe_target, 2)})` : "–", age(a.delay_ms),
       a.keyframes,
       Number.isFinite(a.rate_hz) ? `${fixed(a.rate_hz, 1)} Hz` : "–", a.corrections, a.map_id,
       a.gone ? "–" : fixed(rates[name], 1), `${text(a.loops?.accepted)} of ${text(a.loops?.tried)}`]})));
   table("consistency", ["name", "state", "reason"],
-    agents.filter(([, a]) => a.consistency).map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      name, node("td", a.consistency.state, isQuarantined(a) && !a.gone ? "bad" : ""),
+    agents.filter(([, a]) => a.consistency).map(([name, a]) => ({kind: hasLeft(a) ? "gone" : "", cells: [
+      name, node("td", a.consistency.state, isQuarantined(a) && !hasLeft(a) ? "bad" : ""),
       describeConsistency(a.consistency)]})));
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
     id, typeof count === "object" ? count?.keyframes : count,

@@ -3,9 +3,11 @@ saw, as small pictures of the newest keyframes; and which loop is meant by a cli
 
 from __future__ import annotations
 
+import base64
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from html import escape
 
 import cv2
 import numpy as np
@@ -82,6 +84,21 @@ class LoopViews:
 
     titles: tuple[str, str]
     jpegs: tuple[bytes, bytes]
+
+    def html(self) -> str:
+        """Return the pictures with their titles."""
+        return "".join(map(_figure, self.titles, self.jpegs))
+
+
+def _figure(title: str, jpeg: bytes) -> str:
+    """Return a picture with its title as HTML."""
+    data = base64.b64encode(jpeg).decode()
+    picture = (
+        f'<img style="max-width:100%;max-height:34vh" src="data:image/jpeg;base64,{data}">'
+        if jpeg
+        else "image no longer kept"
+    )
+    return f'<figure style="margin:0 0 10px"><figcaption>{escape(title)}</figcaption>{picture}</figure>'
 
 
 class KeyframePictures:

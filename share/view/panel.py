@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from share.colours import Colour
-from share.protocol.agent_health import LIMITS
+from share.protocol.agent_health import LIMITS, has_left, is_lost
 from share.types import AgentKind
 from share.view import events as ev
 from share.view.room import DrawnRoom, LastCorrection
@@ -41,7 +41,7 @@ class SidePanel:
     @property
     def agents(self) -> dict[str, str]:
         """Names of the agents that are present, by run."""
-        return {a["run"]: label for label, a in self._report.agents.items() if not a["gone"]}
+        return {a["run"]: label for label, a in self._report.agents.items() if not has_left(a)}
 
     def apply(self, event: ev.RoomEvent) -> None:
         match event:
@@ -64,7 +64,9 @@ class SidePanel:
         if self._report.left_out:
             text = f"{self._report.left_out} updates were dropped: this view is too slow"
             parts.append(f'<div style="color:{_BAD}">{text}</div>')
-        for label, agent in sorted(self._report.agents.items(), key=lambda item: (item[1]["gone"], item[0])):
+        for label, agent in sorted(
+            self._report.agents.items(), key=lambda item: (has_left(item[1]), item[0])
+        ):
             run = room.runs.get(agent["run"])
             colour = (128, 128, 128) if run is None else room.colour(run)
             parts.append(self._agent(label, agent, colour, room.corrections.get(agent["run"]), now_s))
@@ -81,7 +83,8 @@ class SidePanel:
         self, label: str, agent: Any, colour: Colour, corrected: LastCorrection | None, now_s: float
     ) -> str:
         history, limit_ms = self._of(label), LIMITS[AgentKind(agent["kind"])].pose_ms
-        state = "gone" if agent["gone"] else agent["state"]
+        is_gone = has_left(agent)
+        state = "gone" if is_gone else agent["state"]
         ages = tuple(history.ages_ms)
         rate = "" if agent["rate_hz"] is None else f", at most {agent['rate_hz']:.1f} Hz"
         rows = [("keyframes", f"{agent['keyframes']}{rate}")]
@@ -100,12 +103,12 @@ class SidePanel:
             f'<tr><td style="{_NAME}">{name}</td><td>{escape(value)}</td></tr>' for name, value in rows
         )
         swatch = "rgb({}, {}, {})".format(*colour)
-        is_bad = state in ("LOST", "SILENT") or bool(agent["trouble"])
+        is_bad = is_lost(agent) or bool(agent["trouble"])
         name_html = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
-        state_colour = "inherit" if agent["gone"] else _BAD if is_bad else _GOOD
+        state_colour = "inherit" if is_gone else _BAD if is_bad else _GOOD
         state_html = f'<b style="color:{state_colour}">{escape(state)}</b>'
         head = f'<div><span style="color:{swatch}">&#9632;</span> {name_html} {state_html}</div>'
-        if agent["gone"]:
+        if is_gone:
             return f'<div style="opacity:.5;margin:0 0 10px">{head}</div>'
         faults = "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
         decision = f'<div style="{_DIM}">{escape(history.decision)}</div>' if history.decision else ""

@@ -16,6 +16,7 @@ import numpy as np
 
 from share.colours import Colour, agent_colour
 from share.mapping.loops import KeyframeKey
+from share.protocol.agent_health import is_lost
 from share.types import F64
 from share.view import drawing as dr
 from share.view import events as ev
@@ -186,7 +187,7 @@ class DrawnRoom:
 
     def _update_presence(self, event: ev.AgentsReported) -> None:
         for entry in event.agents.values():
-            is_current = not entry["gone"] and entry["state"] not in ("LOST", "SILENT")
+            is_current = not entry["gone"] and not is_lost(entry)
             if (run := self.runs.get(entry["run"])) is not None and run.is_current != is_current:
                 run.is_current = is_current
                 self._moved_runs.add(entry["run"])

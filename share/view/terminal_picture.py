@@ -15,7 +15,7 @@ import click
 
 from share.colours import Colour, agent_colour
 from share.errors import printable
-from share.protocol.agent_health import LIMITS
+from share.protocol.agent_health import LIMITS, has_left, is_lost
 from share.types import AgentKind
 
 MIN_COLUMNS, MIN_ROWS = 72, 18  # of a terminal in which it is worth while
@@ -46,7 +46,7 @@ class TerminalPicture:
 
     def lines(self, report: Report, plan: Report, columns: int, rows: int) -> list[str]:
         """Return the picture, at most `rows` lines of at most `columns` characters."""
-        agents = {name: one for name, one in report.get("agents", {}).items() if not one.get("gone")}
+        agents = {name: one for name, one in report.get("agents", {}).items() if not has_left(one)}
         for label in (*report.get("agents", {}), *plan.get("agents", {})):  # in the order in which they came
             self._numbers.setdefault(_name_of(label), len(self._numbers))
         for name, one in agents.items():
@@ -56,7 +56,7 @@ class TerminalPicture:
         troubles = [_trouble_line(name, one, columns) for name, one in sorted(agents.items())]
         text = [*text, *filter(None, troubles)][: max(1, rows - 6)]
         height = min(_MOST_PLAN_ROWS, rows - len(text) - 1)
-        return [*self._plans(plan, columns, height), *text]
+        return [*self._plans(report, plan, columns, height), *text]
 
     def _colour(self, name: str) -> Colour:
         return agent_colour(self._numbers.get(_name_of(name), 0))
@@ -66,7 +66,7 @@ class TerminalPicture:
     def _figures_line(self, name: str, agent: Report, columns: int) -> str:
         limit_ms = LIMITS[AgentKind(agent["kind"])].pose_ms
         state = str(agent.get("state") or "–")
-        is_bad = state in ("LOST", "SILENT") or bool(agent.get("trouble"))
+        is_bad = is_lost(agent) or bool(agent.get("trouble"))
         line = _Line(columns)
         line.add("■ ", self._colour(name))
         line.add(f"{name[:10]:10} {agent['kind']:5} ")
@@ -84,9 +84,9 @@ class TerminalPicture:
 
     # ------------------------------------------------------------------ plans
 
-    def _plans(self, plan: Report, columns: int, rows: int) -> list[str]:
+    def _plans(self, report: Report, plan: Report, columns: int, rows: int) -> list[str]:
         """Return plans of all maps beside each other, each under its own scale, and a line of captions."""
-        agents = plan.get("agents", {})
+        agents = _with_presence(plan.get("agents", {}), report.get("agents", {}))
         ids = list(dict.fromkeys(part["map_id"] for one in agents.values() for part in one["parts"]))
         if not ids or rows < 3:
             return []
@@ -111,9 +111,19 @@ class TerminalPicture:
             for path in parts:
                 canvas.draw_path(path, self._colour(name))
         for name, one in here.items():
-            canvas.draw_agent(name, one, self._colour(name))
+            canvas.draw_agent(name, one, _BAD if one["is_lost"] else self._colour(name))
         caption = f"map of {', '.join(here) or 'no agent now'}, {canvas.metres_wide:.0f} m wide"
         return [*canvas.lines(), f"{printable(caption[:width]):{width}}"]
+
+
+def _with_presence(plans: Report, agents: Report) -> dict[str, Any]:
+    """Return the plan's agents, with `is_lost`; without a place where they have left."""
+    out = {}
+    for name, one in plans.items():
+        agent = agents.get(name, {})
+        where = None if has_left(agent) else one.get("position")
+        out[name] = {**one, "position": where, "is_lost": is_lost(agent)}
+    return out
 
 
 def _trouble_line(name: str, agent: Report, columns: int) -> str:
@@ -167,10 +177,11 @@ class _Canvas:
                 self._dot(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps, colour)
 
     def draw_agent(self, name: str, agent: Report, colour: Colour) -> None:
-        """Draw a disc for a robot, an arrow for others, and the name."""
+        """Draw a disc for a robot, an arrow for others, a cross for who is lost, and the name."""
         row, column = self._cell(*agent["position"])
         turn = round(4 * (agent.get("heading") or 0.0) / math.pi) % 8
         mark = "●" if agent["kind"] == AgentKind.ROBOT else _ARROWS[turn]
+        mark = "✕" if agent["is_lost"] else mark
         text = f"{mark} {name}"
         column = min(column, max(0, self._width - len(text)))
         for k, letter in enumerate(text[: self._width]):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import base64
+import asyncio
 import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from html import escape
-from typing import Any
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
@@ -34,6 +34,7 @@ _MARK_FACES = np.array([[i, j, k] for i, j in ((0, 2), (2, 1), (1, 3), (3, 0)) f
 _MAX_CLICKS = 16  # that wait
 _PORTRAIT = 1.3  # height by width from which the panel lies below, over three fifths of the window
 _ABOVE_PANEL = 0.5  # of half a window's height: what is looked at then stands so far above its middle
+_Given = ParamSpec("_Given")
 _START = (np.array([-3.0, -4.0, 3.0]), np.array([0.0, 0.0, 0.0]))
 
 
@@ -44,6 +45,21 @@ class Click:
     browser: int
     origin: F64
     direction: F64
+
+
+def _in_thread_of_viser(
+    method: Callable[Concatenate[Window, _Given], None],
+) -> Callable[Concatenate[Window, _Given], None]:
+    """Call a method there, and wait: viser's queues wake readers by events that only that thread may set."""
+
+    @wraps(method)
+    def call(window: Window, /, *args: _Given.args, **more: _Given.kwargs) -> None:
+        async def act() -> None:
+            method(window, *args, **more)
+
+        asyncio.run_coroutine_threadsafe(act(), window._server.get_event_loop()).result()
+
+    return call
 
 
 class Window:
@@ -69,13 +85,13 @@ class Window:
         self._server.on_client_connect(self._open)
         self._server.on_client_disconnect(self._close)
 
-    def _open(self, client: Any) -> None:
-        """Called by viser, from a thread of its own."""
+    async def _open(self, client: Any) -> None:
+        """Called by viser in its thread, as every coroutine."""
         camera = _BrowserCamera(client, self._followed)
         camera.look_at_room(self._floor)
         self._cameras[client.client_id] = camera
 
-    def _close(self, client: Any) -> None:
+    async def _close(self, client: Any) -> None:
         self._cameras.pop(client.client_id, None)
 
     def stop(self) -> None:
@@ -88,7 +104,7 @@ class Window:
     def has_served(self) -> bool:
         """Return whether the thread that serves the browsers has run since the last call."""
         has_served, self._has_served = self._has_served, False
-        self._server._event_loop.call_soon_threadsafe(self._note_served)
+        self._server.get_event_loop().call_soon_threadsafe(self._note_served)
         return has_served
 
     def _note_served(self) -> None:
@@ -97,6 +113,7 @@ class Window:
 
     # ------------------------------------------------------------------ drawing
 
+    @_in_thread_of_viser
     def draw(self, drawings: Sequence[dr.Drawing]) -> None:
         """Draw what has changed, all at once."""
         with self._server.atomic():
@@ -156,8 +173,7 @@ class Window:
         )
         handle.on_click(self._take_click)
 
-    def _take_click(self, event: Any) -> None:
-        """Called by viser, from a thread of its own."""
+    async def _take_click(self, event: Any) -> None:
         origin, direction = (np.array(one, np.float64) for one in (event.ray_origin, event.ray_direction))
         self._clicks.append(Click(event.client_id, origin, direction))
 
@@ -165,14 +181,19 @@ class Window:
         """Return the clicks since the last call."""
         return [self._clicks.popleft() for _ in range(len(self._clicks))]
 
+    @_in_thread_of_viser
     def show_views(self, browser: int, views: LoopViews) -> None:
         """Show what the keyframes of a loop saw, in one browser."""
         if (client := self._server.get_clients().get(browser)) is None:
             return
         modal = client.gui.add_modal("loop")
+
+        async def close(_event: Any) -> None:
+            modal.close()
+
         with modal:
-            client.gui.add_html("".join(map(_figure, views.titles, views.jpegs)))
-            client.gui.add_button("close").on_click(lambda _: modal.close())
+            client.gui.add_html(views.html())
+            client.gui.add_button("close").on_click(close)
 
     def _draw_body(self, body: dr.Body) -> None:
         colour = body.colour if body.is_current else _GREY
@@ -236,6 +257,7 @@ class Window:
 
     # ------------------------------------------------------------------ panel and cameras
 
+    @_in_thread_of_viser
     def show_panel(self, html: str, agents: Sequence[str]) -> None:
         """Show the side panel. agents: names that can be followed."""
         if html != self._panel_html:
@@ -243,6 +265,7 @@ class Window:
         self._followed = tuple(agents)
         self._for_each_camera(lambda camera: camera.offer(self._followed))
 
+    @_in_thread_of_viser
     def follow(self, place: Callable[[str], F64 | None]) -> None:
         """Move the cameras that follow an agent. place: T_room_body (4, 4) of an agent by name."""
         self._for_each_camera(lambda camera: camera.follow(place))
@@ -261,7 +284,7 @@ class Window:
             self._cameras.pop(browser, None)
             served = self._server._websock_server
             if (connection := served._live_connections.get(browser)) is not None:
-                self._server._event_loop.call_soon_threadsafe(connection.transport.abort)
+                self._server.get_event_loop().call_soon_threadsafe(connection.transport.abort)
 
 
 class _BrowserCamera:
@@ -271,10 +294,13 @@ class _BrowserCamera:
         self._client = client
         self._agents = agents
         self._choice = client.gui.add_dropdown("camera", _choices(agents), initial_value=_ORBIT, order=-1.0)
-        self._choice.on_update(lambda _: self._choose())
+        self._choice.on_update(self._take_choice)
         self._floor: dr.FloorGrid | None = None
         self._set_position: F64 | None = None  # that this program chose last
         self._last: F64 | None = None  # of the agent that is followed
+
+    async def _take_choice(self, _event: Any) -> None:
+        self._choose()
 
     def offer(self, agents: tuple[str, ...]) -> None:
         if agents != self._agents:
@@ -371,14 +397,3 @@ def _small_picture(jpeg: bytes) -> Any:
     """Return a JPEG as a small image (h, w, 3) uint8; None if it cannot be decoded."""
     small = shrunk(jpeg, _PICTURE_PX)
     return None if small is None else np.repeat(small[:, :, None], 3, axis=2)
-
-
-def _figure(title: str, jpeg: bytes) -> str:
-    """Return a picture with its title as HTML."""
-    data = base64.b64encode(jpeg).decode()
-    picture = (
-        f'<img style="max-width:100%;max-height:34vh" src="data:image/jpeg;base64,{data}">'
-        if jpeg
-        else "image no longer kept"
-    )
-    return f'<figure style="margin:0 0 10px"><figcaption>{escape(title)}</figcaption>{picture}</figure>'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import socket
 import stat
 import time
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import zmq
 from zmq.utils import z85
 
 from share.errors import ShareError, UsageError
-from share.net import keys
+from share.net import keys, zeromq_socket
 from share.net.keys import AgentKeys, AllowList, EdgeKeys, KeyPair
 from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.wire.messages import peer_id
@@ -309,7 +310,7 @@ class House:
     def refusals(self, agent: AgentLink) -> list[str]:
         """What the edge says of an agent that gets nothing, and the agent nothing either."""
         lines: list[str] = []
-        end = time.monotonic() + 3
+        end = time.monotonic() + 15
         while not (lines and agent.trouble()):
             assert time.monotonic() < end, (lines, agent.trouble())
             assert not agent.send([b"in?"])
@@ -409,6 +410,29 @@ def test_an_edge_without_keys(house: House) -> None:
         plain.close()
     with closing(bind(plain.endpoint, EdgeKeys(house.pair, keys.allow_list(house.folder)))) as house.edge:
         house.greets(agent, 5)  # as soon as the right edge is there
+
+
+def test_an_edge_that_does_not_answer_is_not_said_to_require_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is paused, say: the system still accepts connections for it."""
+    monkeypatch.setitem(zeromq_socket._COMMON_OPTIONS, zmq.HANDSHAKE_IVL, 200)
+    with socket.create_server(("127.0.0.1", 0)) as paused:
+        agent = connect(f"tcp://127.0.0.1:{paused.getsockname()[1]}", 1)
+        with closing(agent):
+            end = time.monotonic() + 1.5
+            while time.monotonic() < end:
+                assert agent.receive(20) is None and agent.trouble() is None
+
+
+def test_who_leaves_before_the_handshake_is_not_said_to_use_keys() -> None:
+    """An agent that gave up while the edge was paused, or a port scanner."""
+    with closing(bind("tcp://127.0.0.1:0")) as edge:
+        host, _, port = edge.endpoint.removeprefix("tcp://").rpartition(":")
+        for greeting in (b"", b"\xff\x00\x00\x00\x00\x00\x00\x00\x01\x7f\x03"):
+            with socket.create_connection((host, int(port))) as leaving:
+                leaving.sendall(greeting)
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            assert edge.receive(20) is None and edge.refusals() == []
 
 
 def test_a_revoked_key_is_disconnected_and_others_reconnect(house: House) -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from mmap import mmap
 from pathlib import Path
 from typing import Any
 
@@ -323,3 +324,32 @@ def test_an_address_needs_no_scheme():
     assert parse_address("192.168.1.10:5555") == parse_address("tcp://192.168.1.10:5555")
     assert str(parse_address("[::1]:5555")) == "tcp://[::1]:5555"
     assert parse_address("localhost:0", bind=True).local
+
+
+@pytest.mark.parametrize("loads", [True, False])
+def test_no_agent_is_blamed_for_the_growth_of_an_edge_that_loads_a_map(loads: bool) -> None:
+    """Its keyframes wait meanwhile. A peer with small parts would make it grow, too."""
+    with ExitStack() as stack:
+        edge = stack.enter_context(closing(bind("tcp://127.0.0.1:0")))
+        agent = stack.enter_context(closing(connect(edge.endpoint, 7)))
+        _until(lambda: agent.send([b"hello"]) and edge.receive(20) is not None)
+        edge.expect_growth(loads)
+        at = parse_address(edge.endpoint)
+        stack.enter_context(socket.create_connection((at.host, at.port)))  # wakes the guard's thread
+        time.sleep(0.1)
+        for _ in range(8):  # more than the largest message
+            assert agent.send([bytes(MAX_FRAME_BYTES), bytes(MAX_FRAME_BYTES)])
+        time.sleep(0.3)
+        loaded = stack.enter_context(closing(mmap(-1, 60_000_000)))
+        loaded.write(bytes([1]) * 60_000_000)
+        time.sleep(0.3)
+        edge.expect_growth(False)
+        time.sleep(0.1)
+        said = edge.refusals()
+        assert bool(said) is not loads
+
+
+def _until(is_done: Callable[[], bool]) -> None:
+    end = time.monotonic() + 10
+    while not is_done():
+        assert time.monotonic() < end

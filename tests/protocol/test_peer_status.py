@@ -7,6 +7,7 @@ from helpers.hellos import hello_of
 from helpers.model_edge import MS, S
 
 from share.config import Config
+from share.protocol.agent_health import MISSED_S
 from share.protocol.common_events import Tick
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
@@ -85,6 +86,31 @@ def test_a_silent_agent_is_shown_as_silent() -> None:
         assert shown(edge)["pose_age_ms"] == round(20 + (at_s - 1) * 1000, 1)
     edge.handle(PeerMessageReceived(wire.peer_id(1), encode(OK)), 61 * S)
     assert shown(edge)["state"] == "OK"
+
+
+def test_an_agent_that_went_without_a_bye_is_trouble_for_a_minute() -> None:
+    """A crash and a bye do not look alike."""
+    edge = edge_with(OK, S)
+    for at_s in (1.75, 4.5, 60.0):
+        edge.handle(Tick(), round(at_s * S))
+        assert shown(edge)["trouble"] == [f"SILENT: silent for {at_s - 1:.1f} s; its last state was OK"]
+        assert shown(edge)["gone"] == (at_s > 4)
+    edge.handle(Tick(), round((1 + MISSED_S + 0.1) * S))
+    assert (shown(edge)["gone"], shown(edge)["trouble"]) == (True, [])
+    assert shown(edge)["reason"] == "gone without a word; its last state was OK"
+
+
+def test_nobody_misses_who_said_bye_or_came_again() -> None:
+    edge = edge_with(OK, S)
+    edge.handle(PeerMessageReceived(wire.peer_id(1), encode(wire.Bye())), 2 * S)
+    edge.handle(Tick(), 10 * S)
+    assert shown(edge)["trouble"] == []
+    edge = edge_with(OK, S)
+    edge.handle(Tick(), 10 * S)
+    for message in (hello_of("ann", 2), OK):  # it crashed, and was started again
+        edge.handle(PeerMessageReceived(wire.peer_id(2), encode(message)), 10 * S)
+    (earlier,) = (one for label, one in edge.report({})["agents"].items() if label != "ann")
+    assert (earlier["gone"], earlier["trouble"], shown(edge)["trouble"]) == (True, [], [])
 
 
 def test_an_agent_that_left_keeps_its_last_state() -> None:

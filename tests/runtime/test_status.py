@@ -217,7 +217,7 @@ def test_metrics_are_read_back():
         ("share_edge_agent_gone", ann, 0),
         ("share_edge_agent_gone", bob, 1),
         ("share_edge_agent_info", ann | {("state", "OK"), ("map", "0")}, 1),
-        ("share_edge_agent_info", bob | {("state", "OK"), ("map", "")}, 1),
+        ("share_edge_agent_info", bob | {("state", "GONE"), ("map", "")}, 1),
         ("share_edge_maps", set(), 2),
         ("share_edge_map_keyframes", {("map", "3")}, 1),
         ("share_edge_failed_steps_total", set(), 2),
@@ -226,6 +226,18 @@ def test_metrics_are_read_back():
         ("share_edge_step_seconds_sum", {("step", "solve")}, 0.08),
     ]:
         assert read[name, frozenset(labels)] == pytest.approx(value), name
+
+
+def test_no_alert_goes_on_for_ever_once_an_agent_has_left():
+    old = {"state": "SILENT", "pose_age_ms": 90e3, "last_received_s": 90.0, "gone": True}
+    who = {("agent", "ann"), ("kind", "ar")}
+    for trouble in ([], ["SILENT: silent for 90 s"]):
+        body, _ = edge_metrics.render_metrics({"agents": {"ann": {**AGENT, **old, "trouble": trouble}}})
+        read = metrics(body)
+        state = "SILENT" if trouble else "GONE"
+        assert read["share_edge_agent_info", frozenset(who | {("state", state), ("map", "0")})] == 1
+        age_s = read.get(("share_edge_pose_age_seconds", frozenset(who)))
+        assert age_s == (90.0 if trouble else None)
 
 
 def test_metrics_that_the_report_lacks_are_omitted():

@@ -55,6 +55,16 @@ def test_late_poses_are_red_and_what_is_gone_is_left_out() -> None:
     assert drawn({"agents": {"ann": agent(gone=True)}}, {"agents": {}}) == []
 
 
+def test_who_is_silent_stays_in_sight_and_who_has_left_does_not() -> None:
+    plan = {"agents": {"ann": place(EAST)}}
+    missed = agent(gone=True, state="SILENT", trouble=["SILENT: silent for 9.0 s"])
+    lines = drawn({"agents": {"ann": missed}}, plan)
+    assert "✕ ann" in "".join(lines) and "→" not in "".join(lines)
+    assert "SILENT" in lines[-2] and "silent for 9.0 s" in lines[-1]
+    left = drawn({"agents": {"ann": agent(gone=True)}}, plan)
+    assert "ann" not in "".join(left) and "map of no agent now" in left[-1]
+
+
 def test_paths_and_agents_are_where_they_are() -> None:
     plan = {"agents": {"ann": place(EAST), "tom": place(NORTH, kind="robot")}}
     lines = drawn({"agents": {"ann": agent(), "tom": agent("robot")}}, plan)

@@ -299,6 +299,57 @@ def test_browsers_count_from_the_handshake_on(room: LiveRoom) -> None:
 
 
 @needs_viser
+def test_what_browsers_are_sent_is_queued_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """viser wakes who waits for it by an event of asyncio: another thread would meet its list of waiters
+    while it changes, and end the room for everybody."""
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    from share.net.http_guard import HttpGuard, listen
+    from share.net.transport import Address
+    from share.view import drawing as dr
+    from share.view.loop_views import LoopViews
+    from share.view.window import Window
+
+    listener, bound = listen(Address("127.0.0.1", 0))
+    window, threads, push = Window(listener, HttpGuard(bound), "test"), set[str](), AsyncMessageBuffer.push
+
+    def note(buffer: Any, message: Any) -> None:
+        threads.add(threading.current_thread().name)
+        push(buffer, message)
+
+    try:
+        asked = list[str]()
+        window._server.get_event_loop().call_soon_threadsafe(
+            lambda: asked.append(threading.current_thread().name)
+        )
+        assert soon(lambda: bool(asked))
+        monkeypatch.setattr(AsyncMessageBuffer, "push", note)
+        with browser(str(bound).removeprefix("tcp://")) as one:
+            one.send(camera())
+            uuid, box = dropdown(one), np.eye(4)
+            window.draw(
+                [
+                    dr.FloorGrid(0.0, (0.0, 0.0), (1.0, 1.0)),
+                    dr.Marks("/marks", np.zeros((2, 3)), (1, 2, 3)),
+                    dr.Body("/agents/0", "ann", AgentKind.AR, box, box, (0.8, 0.6), (1, 2, 3), True),
+                    dr.Announcement("maps merged", "x"),
+                ]
+            )
+            window.show_panel("<b>ann</b>", ["ann"])
+            for value in ("from above", "follow ann"):
+                choice = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
+                one.send(msgspec.msgpack.encode(choice))
+                (looking,) = window._cameras.values()
+                assert soon(lambda value=value, looking=looking: looking._choice.value == value)  # type: ignore[misc]
+            window.follow(lambda name: np.eye(4))
+            window.show_views(next(iter(window._cameras)), LoopViews(("a", "b"), (b"", b"")))
+        assert soon(lambda: not window._cameras)
+    finally:
+        window.stop()
+    assert threads == set(asked)
+
+
+@needs_viser
 @pytest.mark.parametrize("failing", ["offer", "follow"])
 def test_a_failing_browser_is_disconnected_alone(failing: str) -> None:
     from share.net.http_guard import HttpGuard, listen
