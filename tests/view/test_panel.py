@@ -50,7 +50,7 @@ def test_it_says_of_an_agent_what_decides() -> None:
 
 
 def test_trouble_and_decisions_are_said_with_their_reason() -> None:
-    late = AGENT | {"trouble": ["poses come 3.4 s, limit 20 ms"]}
+    late = AGENT | {"trouble": ["poses are 3.4 s old, limit 20 ms"]}
     text = words(
         panel_of(
             ev.AgentsReported({"ann": late}, ("the disk is full",), left_out=7),
@@ -59,7 +59,7 @@ def test_trouble_and_decisions_are_said_with_their_reason() -> None:
         )
     )
     for part in (
-        "poses come 3.4 s, limit 20 ms",
+        "poses are 3.4 s old, limit 20 ms",
         "the disk is full",
         "7 updates were dropped: this view is too slow",
     ):
