@@ -63,3 +63,9 @@ def _character_class(character: str) -> str | None:
     if kind in ("Mn", "Mc"):
         return "M"
     return "N" if kind == "Nd" else None
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Return a key that sorts names as people do: agent2 before agent10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]

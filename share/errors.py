@@ -76,7 +76,7 @@ def install_hint(packages: str, extra: str) -> str:
     how = f"pip install 'share-slam[{extra}]', in a checkout .venv/bin/pip install -e '.[{extra}]'"
     if getattr(sys, "frozen", False):
         return f"this frozen program has no {packages}; use a computer with Python: {how}"
-    return f"{packages} is not installed: {how}"
+    return f"{packages} {'are' if ',' in packages else 'is'} not installed: {how}"
 
 
 _MAX_LINE_LENGTH = 1500  # characters

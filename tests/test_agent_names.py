@@ -7,6 +7,7 @@ from unicodedata import normalize
 import pytest
 from helpers.hellos import hello_of
 
+from share.agent_names import natural_order
 from share.recordings.session import is_agent_name
 
 
@@ -61,3 +62,16 @@ def test_invalid_names_are_refused(name: str) -> None:
 
 def test_names_are_compared_in_normal_form() -> None:
     assert hello_of(normalize("NFD", "Jürgen"), 1).name == "Jürgen"
+
+
+def test_numbers_in_names_sort_as_numbers():
+    names = ["agent10", "agent2", "Ann", "7up", "agent2b", "agent", "agent1/3"]
+    assert sorted(names, key=natural_order) == [
+        "7up",
+        "Ann",
+        "agent",
+        "agent1/3",
+        "agent2",
+        "agent2b",
+        "agent10",
+    ]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
+
 from share.colours import (
     AGENT_COLOURS,
     POLICY_COLOURS,
@@ -18,6 +21,13 @@ def test_every_policy_has_a_colour_of_its_own() -> None:
     assert set(POLICY_COLOURS) == set(POLICY_NAMES)
     assert len(set(POLICY_COLOURS.values())) == len(POLICY_COLOURS)
     assert len(set(AGENT_COLOURS)) == len(AGENT_COLOURS)
+
+
+def test_thirty_agents_have_colours_that_can_be_told_apart() -> None:
+    rgb = np.array([[agent_colour(k) for k in range(30)]], np.float32) / 255
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab)[0]
+    distances = np.linalg.norm(lab[:, None] - lab[None], axis=2)
+    assert distances[np.triu_indices(30, 1)].min() > 12  # CIE76; 2.3 is just noticeable
 
 
 def test_a_policy_keeps_its_colour_whoever_stands_beside_it() -> None:

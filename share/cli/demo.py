@@ -118,10 +118,11 @@ def _check_policy(policy: str, is_compared: bool, true_error: bool) -> None:
 
 def _play(session: Session, seconds: float, terms: RunOptions, view: bool, out: Path, as_json: bool) -> None:
     """Play a session in real time; show how accurately the agents knew their poses."""
-    from share.devices.host import core_count
+    from share.lab.evaluate.provenance import describe_machine
     from share.lab.evaluate.real_time import play_in_real_time
     from share.lab.evaluate.scoring import join_times, score_session
 
+    machine = describe_machine()
     screen = RunScreen(view)
     folders = play_in_real_time(session, seconds, terms, out, screen.show, screen.pages)
     screen.end()
@@ -132,14 +133,29 @@ def _play(session: Session, seconds: float, terms: RunOptions, view: bool, out: 
         click.echo(json.dumps(_document(terms.policy, result, since_s)))
         return
     click.echo(_score_table(result, since_s, terms.policy == STREAMED))
-    if core_count() <= len(folders):
-        warning = (
-            f"{len(folders)} agents and the edge shared {core_count()} cores, so frames waited; on separate "
-            "machines they would not"
-        )
-        click.echo(warning)
+    for line in _advice(result, seconds, machine["load"], machine["cores"]):
+        click.echo(line)
     if picture is not None:
         click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
+
+
+def _advice(result: SessionScore, seconds: float, load: float, cores: int) -> list[str]:
+    """Return what to do where agents did not meet, and why frames waited. load, cores: of the machine before
+    the run."""
+    from share.lab.evaluate.provenance import busy_text
+
+    count, lines = len(result.agents), []
+    if result.joint is None:
+        longer = f"{min(600.0, 2 * seconds):g}"
+        lines.append(f"no two agents met in {seconds:g} s; in a longer run they may: --seconds {longer}")
+    if busy := busy_text(load, cores, "the run"):
+        lines.append(f"{busy}, so frames waited and keyframes came late; repeat it when idle")
+    elif cores <= count:
+        lines.append(
+            f"{count} agents and the edge shared {cores} cores, so frames waited; on separate machines they "
+            "would not"
+        )
+    return lines
 
 
 def _draw_paths(out: Path, result: SessionScore) -> Path | None:
@@ -182,9 +198,14 @@ def _document(policy: str, result: SessionScore, since_s: Mapping[str, float]) -
 def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_json: bool) -> None:
     """Play a session by the base policy and by that of `terms`; show both."""
     from share.cli.terminal import aligned_table
-    from share.devices.host import core_count
     from share.files.json_file import nan_to_none
-    from share.lab.evaluate.side_by_side import ScoredTrial, comparison_rows, draw_side_by_side, headline
+    from share.lab.evaluate.side_by_side import (
+        ScoredTrial,
+        busy_note,
+        comparison_rows,
+        draw_side_by_side,
+        headline,
+    )
     from share.lab.evaluate.trial import run_trial
 
     scored, live = [], LiveLine()
@@ -205,10 +226,8 @@ def _compare(session: Session, terms: RunOptions, config: Config, out: Path, as_
         return
     click.echo(aligned_table(comparison_rows(scored)))
     runs = ", ".join(str(one.trial.folder) for one in scored)
-    load, cores = scored[0].trial.record["machine"]["load"], core_count()
-    if load > 0.5 * cores:
-        busy = f"other programs kept this machine busy (load {load:g} on {cores} cores before the first run)"
-        click.echo(f"\n{busy}: latencies are not those of the policies; repeat it when idle")
+    if note := busy_note(scored):
+        click.echo(f"\n{note}")
     click.echo(f"\n{headline(scored)}\n\npicture: {picture}   runs: {runs}")
 
 

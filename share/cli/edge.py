@@ -134,6 +134,7 @@ def edge(
     if http_token is not None and http is None and view is None:
         raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
     token = None if http_token is None else read_token(http_token)
+    _check_apart(bind, http, view, token)
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
@@ -180,6 +181,22 @@ def _edge_access(endpoint: str, keys: EdgeKeys | None, allowed: frozenset[Permis
     lent = LentKeys(secret)
     keys.allowed.public_key_of = lambda name: lent.pair(name).public
     return EdgeAccess(address, allowed, keys.allowed.path.parent, keys.own.public, secret)
+
+
+def _check_apart(bind: str, http: str | None, view: str | None, token: str | None) -> None:
+    """Raise UsageError if two options name one address, or one of them none."""
+    from share.net.http_guard import http_address
+    from share.net.transport import parse_address
+
+    named = {"--bind": parse_address(bind, bind=True)}
+    for option, text in (("--http", http), ("--view", view)):
+        if text is None:
+            continue
+        address = http_address(option, text, token)
+        for other, taken in named.items():
+            if address == taken and address.port:
+                raise UsageError(f"{other} and {option} name the same port {address.port}; give each its own")
+        named[option] = address
 
 
 class _EdgePages:

@@ -244,7 +244,8 @@ class LoopAcceptance:
         if objection:
             self._add_pending(loop)
             return LoopDecision(False, f"loop {loop}: would merge two maps, {places}{objection}")
-        return self._accept(consistent, f"loop {loop}: {places}")
+        a, b = (f"keyframe {key.id} of {key.agent}" for key in (loop.a, loop.b))
+        return self._accept(consistent, f"{a} and {b} see the same place; {places}")
 
     def _join_objection(self, loop: Loop, evidence: LoopEvidence) -> str:
         """Reason why loops at enough places may still be of a copy, or empty."""
@@ -371,7 +372,7 @@ class LoopAcceptance:
         self._overlap_check.begin_probation(loops[-1])
         added = self.accept_fitting()
         survivor, absorbed = (graph.odometry.segments[s].name for s in references)
-        reason += f"{pending_text(added)}: map {absorbed} merged into {survivor}"
+        reason = f"map {absorbed} merged into {survivor}: {reason}{pending_text(added)}"
         return LoopDecision(True, reason, (survivor, absorbed), (*loops, *added), T_join=T_join)
 
     def _add_loops(self, loops: Sequence[Loop]) -> None:

@@ -86,13 +86,14 @@ def agent_troubles(kind: AgentKind, report: Mapping[str, Any], joined_s: float) 
     out = []
     if is_lost(report):
         out.append(f"{state}: {report['reason']}" if report["reason"] else state)
-    for what, ms, limit_ms in (
-        ("poses come", report["pose_ms"], limits.pose_ms),
-        ("its delay is", report["delay_ms"], limits.delay_ms),
+    pose_ms = report["pose_ms"] if joined_s > _RECENT_S else None  # the first poses are not what is usual
+    for before, ms, after, limit_ms in (
+        ("poses are", pose_ms, " old", limits.pose_ms),
+        ("its delay is", report["delay_ms"], "", limits.delay_ms),
     ):
         if ms is not None and ms > limit_ms:
             late = f"{ms / 1e3:.1f} s" if ms >= 1000 else f"{ms:.0f} ms"
-            out.append(f"{what} {late}, limit {limit_ms:.0f} ms")
+            out.append(f"{before} {late}{after}, limit {limit_ms:.0f} ms")
     if (error_cm := report["error_cm"]) is not None and error_cm > limits.error_cm:
         out.append(f"its place is off by {error_cm:.0f} cm, limit {limits.error_cm:.0f} cm")
     clock_error_ms = report["clock_error_ms"]

@@ -20,6 +20,9 @@ body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 84rem; 
 header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem }
 h1 { font-size: 1.25rem; margin: 0 }
 h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
+summary { cursor: pointer }
+summary h2 { display: inline-block }
+small { color: var(--dim); font-weight: 400 }
 header span, td.none { color: var(--dim) }
 a { color: inherit }
 td i { display: inline-block; width: .7em; height: .7em; margin-right: .4em; flex: none }
@@ -27,7 +30,7 @@ td i { display: inline-block; width: .7em; height: .7em; margin-right: .4em; fle
 .bad, #mark.bad { color: var(--bad) }
 #fingerprint { color: var(--dim); overflow-wrap: anywhere }
 #code { font-size: 1.4em; letter-spacing: .1em }
-#trouble { margin: .5rem 0 0; padding-left: 1.2rem; color: var(--bad); overflow-wrap: anywhere }
+.trouble { margin: .5rem 0 0; padding-left: 1.2rem; color: var(--bad); overflow-wrap: anywhere }
 .wide { overflow-x: auto }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums }
 th, td { padding: .25rem .75rem .25rem 0; text-align: right; white-space: nowrap }
@@ -43,11 +46,12 @@ td:first-child { max-width: 14rem }
 tr.gone { color: var(--dim) }
 #agents td:nth-child(4) { white-space: normal; min-width: 9rem; max-width: 18rem; overflow-wrap: anywhere }
 .stale { opacity: .45 }
-#plan { display: flex; flex-wrap: wrap; gap: 1rem }
-#plan figure { margin: 0; flex: 1 1 20rem; min-width: 0; max-width: 36rem }
-#plan figcaption { color: var(--dim); overflow-wrap: anywhere }
-#plan svg { width: 100%; height: auto; max-height: 22rem; border: 1px solid var(--line); border-radius: 4px }
-#plan text { fill: currentColor }
+.plan { display: flex; flex-wrap: wrap; gap: 1rem }
+.plan figure { margin: 0; flex: 1 1 20rem; min-width: 0; max-width: 36rem }
+.plan figcaption { color: var(--dim); overflow-wrap: anywhere }
+.plan svg { width: 100%; height: auto; max-height: 22rem; border: 1px solid var(--line); border-radius: 4px }
+.plan text { fill: currentColor }
+#hint { display: none; color: var(--dim); margin: 0 }
 @media (max-width: 48rem) {
   body { font-size: 14px; padding: .7rem }
   table, tbody { display: block }
@@ -57,33 +61,51 @@ tr.gone { color: var(--dim) }
   td, td:first-child, #agents td:nth-child(4), #consistency td:nth-child(3) {
     display: flex; justify-content: space-between; gap: .6rem; border: 0; padding: .1rem 0; max-width: none;
     min-width: 0; text-align: right; white-space: normal; overflow-wrap: anywhere }
-  td::before { content: attr(data-label); color: var(--dim); flex: 0 1 auto; min-width: 4rem;
+  td::before { content: attr(data-label); color: var(--dim); flex: 0 1 auto; min-width: min-content;
                text-align: left }
+  #agents td:nth-child(2) { overflow-wrap: normal }
   td:first-child { grid-column: 1 / -1; font-weight: 600; justify-content: flex-start }
   td:first-child::before { display: none }
   td[data-label=reason] { grid-column: 1 / -1 }
   #loops td:first-child { grid-column: auto; font-weight: inherit; justify-content: space-between }
   #loops td:first-child::before { display: inline }
-  td.empty { display: none }
+  td.empty { display: none !important }
+  #agents.many ~ #hint { display: block }
+  #agents.many tr { cursor: pointer }
+  #agents.many tr:not(.open) { grid-template-columns: 1fr auto 4rem; padding: .15rem 0 }
+  #agents.many tr:not(.open) td:first-child { grid-column: auto; font-weight: inherit }
+  #agents.many tr:not(.open) td:nth-child(n+5) { display: none }
+  #agents.many tr:not(.open) td::before { display: none }
+  #agents.many tr:not(.open) td:nth-child(3) { justify-content: flex-end }
 }
 </style>
 <header><h1>SHARE edge</h1><b id="mark">…</b><a id="room" hidden>live room</a><span id="about"></span>
 </header>
-<ul id="trouble"></ul>
+<ul id="trouble" class="trouble"></ul>
+<details id="troubles" hidden><summary></summary><ul class="trouble"></ul></details>
 <main>
-<h2>Agents</h2><div class="wide"><table id="agents" class="words"></table></div>
-<h2>Plan</h2><div id="plan"></div>
-<h2>Agent consistency</h2><div class="wide"><table id="consistency"></table></div>
-<h2>Maps</h2><div class="wide"><table id="maps"></table></div>
-<h2>Robots</h2><div class="wide"><table id="robots"></table></div>
-<h2>Objects</h2><div class="wide"><table id="objects"></table></div>
-<h2>Clients</h2><div class="wide"><table id="clients"></table></div>
+<h2>Agents <small id="counts"></small></h2>
+<div class="wide"><table id="agents" class="words"></table><p id="hint">touch one for its figures</p></div>
+<h2>Plan</h2><div id="plan" class="plan"></div>
+<details id="plans" hidden><summary></summary><div class="plan"></div></details>
+<details open><summary><h2>Agent consistency <small></small></h2></summary>
+<div class="wide"><table id="consistency"></table></div></details>
+<details open><summary><h2>Maps <small></small></h2></summary>
+<div class="wide"><table id="maps"></table></div></details>
+<details open><summary><h2>Robots <small></small></h2></summary>
+<div class="wide"><table id="robots"></table></div></details>
+<details open><summary><h2>Objects <small></small></h2></summary>
+<div class="wide"><table id="objects"></table></div></details>
+<details open><summary><h2>Clients <small></small></h2></summary>
+<div class="wide"><table id="clients"></table></div></details>
 <section id="headset" hidden><h2>Headset page</h2>
 <p><span id="address"></span>, code for the next wearer: <b id="code"></b><br>
 SHA-256: <span id="fingerprint"></span></p>
 <div class="wide"><table id="wearers"></table></div></section>
-<h2>Loops</h2><div class="wide"><table id="loops"></table></div>
-<h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
+<details open><summary><h2>Loops <small></small></h2></summary>
+<div class="wide"><table id="loops"></table></div></details>
+<details open><summary><h2>Times, ms <small></small></h2></summary>
+<div class="wide"><table id="times"></table></div></details>
 </main>
 <svg id="svg" hidden></svg>
 <script>
@@ -91,6 +113,8 @@ SHA-256: <span id="fingerprint"></span></p>
 const at = id => document.getElementById(id);
 const entries = x => Object.entries(x ?? {});
 const text = x => x === null || x === undefined || x === "" ? "–" : String(x);
+const MANY = 8;  // rows; of more, what is seldom needed is folded
+const byName = new Intl.Collator("en", {numeric: true}).compare;  // agent2 before agent10
 const fixed = (x, n) => Number.isFinite(x) ? x.toFixed(n) : "–";
 
 function node(tag, content, kind) {
@@ -115,6 +139,19 @@ function table(id, head, rows) {
   const top = node("tr", "");
   top.append(...head.map(h => node("th", h)));
   at(id).replaceChildren(...(rows.length ? [top] : []), ...body);
+  const section = at(id).closest("details");
+  if (!section) return;
+  section.querySelector("small").textContent = rows.length > 1 ? rows.length : "";
+  if (rows.length > MANY && !section.dataset.folded) {  // once; whoever opens it keeps it open
+    section.dataset.folded = "yes";
+    section.open = false;
+  }
+}
+
+function foldMore(id, label, nodes) {
+  at(id).hidden = !nodes.length;
+  at(id).firstElementChild.textContent = nodes.length ? label : "";
+  at(id).lastElementChild.replaceChildren(...nodes);
 }
 
 function duration(s) {
@@ -178,8 +215,36 @@ function planOfMap(id, agents) {
 
 function showPlan(plan) {
   const ids = [...new Set(entries(plan.agents).flatMap(([, a]) => a.parts.map(p => p.map_id)))];
-  const figures = ids.map(id => planOfMap(id, plan.agents)).filter(Boolean);
-  at("plan").replaceChildren(...(figures.length ? figures : [node("span", "no path yet", "none")]));
+  const members = id => entries(plan.agents).filter(([, a]) => a.map_id === id && a.position).length;
+  const figures = ids.sort((a, b) => members(b) - members(a))
+    .map(id => planOfMap(id, plan.agents)).filter(Boolean);
+  const first = figures.length > 4 ? 3 : 4;
+  at("plan").replaceChildren(
+    ...(figures.length ? figures.slice(0, first) : [node("span", "no path yet", "none")]));
+  foldMore("plans", `${figures.length - first} more maps`, figures.slice(first));
+}
+
+// Agents whose trouble is the same share a line.
+function agentTroubles(agents) {
+  const names = new Map();
+  for (const [name, a] of agents)
+    for (const line of a.trouble ?? []) names.set(line, [...names.get(line) ?? [], name]);
+  return [...names].map(([line, who]) => {
+    const more = who.length > 4 ? ` and ${who.length - 3} more` : "";
+    return `${(more ? who.slice(0, 3) : who).join(", ")}${more}: ${line}`;
+  });
+}
+
+const opened = new Set();  // names of agents whose figures are shown though there are many
+function makeFoldable(names) {
+  at("agents").classList.toggle("many", names.length > MANY);
+  [...at("agents").querySelectorAll("tr:has(td)")].forEach((row, k) => {
+    row.classList.toggle("open", opened.has(names[k]));
+    row.onclick = () => {
+      if (!opened.delete(names[k])) opened.add(names[k]);
+      row.classList.toggle("open");
+    };
+  });
 }
 
 let reported = {};  // agents of the newest report
@@ -230,7 +295,11 @@ function show(now) {
   updateRates(now);
   reported = now.agents ?? {};
   Object.keys(now.agents ?? {}).forEach(colour);  // in the order in which they came, as in the live room
-  const trouble = [...now.trouble ?? [], ...now.agent_trouble ?? []];
+  const isTroubled = a => a.trouble?.length > 0;
+  const isMany = entries(now.agents).length > MANY;
+  const agents = entries(now.agents).sort(([a, x], [b, y]) =>
+    hasLeft(x) - hasLeft(y) || (isMany && isTroubled(y) - isTroubled(x)) || byName(a, b));
+  const trouble = [...now.trouble ?? [], ...agentTroubles(agents)];
   const count = matches => entries(now.agents).filter(([, a]) => matches(a)).length;
   const agentCount = n => `${n} agent${n === 1 ? "" : "s"}`;
   const stale = count(a => isLost(a) || isStale(a));
@@ -240,16 +309,23 @@ function show(now) {
   if (stale) warnings.push(`${agentCount(stale)} without a current pose`);
   if (quarantined) warnings.push(`${agentCount(quarantined)} quarantined`);
   mark(trouble.length ? "trouble" : warnings.join(", ") || "ok", trouble.length || warnings.length);
-  at("trouble").replaceChildren(...trouble.concat(degraded, now.refused ?? []).map(t => node("li", t)));
+  const lines = trouble.concat(degraded, now.refused ?? []).map(t => node("li", t));
+  const first = lines.length > MANY ? MANY - 2 : MANY;
+  at("trouble").replaceChildren(...lines.slice(0, first));
+  foldMore("troubles", `${lines.length - first} more lines`, lines.slice(first));
   const about = [`up ${duration(now.uptime_s)}`];
-  if (now.waiting !== undefined) about.push(`waiting ${text(now.waiting)}`);
+  if (now.waiting) about.push(`${now.waiting} keyframe${now.waiting === 1 ? "" : "s"} waiting`);
   if (typeof now.last_solve_s === "number") about.push(`solved ${duration(now.last_solve_s)} ago`);
   if (now.failed_steps) about.push(`failed steps ${now.failed_steps}`);
   at("room").hidden = !now.live_room;
   const port = now.live_room?.split(":").pop();
   if (port) at("room").href = `${location.protocol}//${location.hostname}:${port}/`;
-  at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
-  const agents = entries(now.agents).sort(([a, x], [b, y]) => hasLeft(x) - hasLeft(y) || (a < b ? -1 : 1));
+  if (now.policy) about.push(`policy ${now.policy}`);
+  if (now.version) about.push(`SHARE ${now.version}`);
+  at("about").textContent = about.join(" · ");
+  const gone = count(hasLeft), troubled = count(isTroubled);
+  at("counts").textContent = isMany ? [`${agents.length - gone}`, troubled && `${troubled} in trouble`,
+    gone && `${gone} gone`].filter(Boolean).join(", ") : "";
   table("agents",
     ["name", "state", "pose age", "reason", "kind", "poses come after", "QoE (target)", "delay",
      "keyframes", "rate", "corrections", "map", "kB/s", "loops"],
@@ -261,6 +337,7 @@ function show(now) {
       a.keyframes,
       Number.isFinite(a.rate_hz) ? `${fixed(a.rate_hz, 1)} Hz` : "–", a.corrections, a.map_id,
       a.gone ? "–" : fixed(rates[name], 1), `${text(a.loops?.accepted)} of ${text(a.loops?.tried)}`]})));
+  makeFoldable(agents.map(([name]) => name));
   table("consistency", ["name", "state", "reason"],
     agents.filter(([, a]) => a.consistency).map(([name, a]) => ({kind: hasLeft(a) ? "gone" : "", cells: [
       name, node("td", a.consistency.state, isQuarantined(a) && !hasLeft(a) ? "bad" : ""),

@@ -91,6 +91,9 @@ class Removed:
     name: str
 
 
+ANNOUNCED_S = 6.0  # s, for which an announcement is shown
+
+
 @dataclass(frozen=True)
 class Announcement:
     """A line for people, shown for a while."""

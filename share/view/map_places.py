@@ -1,7 +1,9 @@
-"""Where each map stands in the room: the first at the origin, the others beside it, as long as they hold a
-keyframe."""
+"""Where each map stands in the room: the first at the origin, the others beside it in a square, as long as
+they hold a keyframe."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -47,4 +49,12 @@ class MapPlaces:
 
     def offset(self, map_id: str) -> F64:
         """Return where the map's origin is (3,), m."""
-        return np.array([0.0, _MAP_SPACING_M * self._slots.get(map_id, 0), 0.0])
+        x, y = _square(self._slots.get(map_id, 0))
+        return np.array([_MAP_SPACING_M * x, _MAP_SPACING_M * y, 0.0])
+
+
+def _square(slot: int) -> tuple[int, int]:
+    """Return column and row of a slot: slots fill squares of growing sides, so many maps fit one view."""
+    side = math.isqrt(slot)
+    beyond = slot - side * side
+    return (beyond, side) if beyond <= side else (side, 2 * side - beyond)

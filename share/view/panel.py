@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
-from share.colours import Colour
+from share.agent_names import natural_order
 from share.protocol.agent_health import LIMITS, has_left, is_lost
 from share.types import AgentKind
 from share.view import events as ev
@@ -21,6 +22,7 @@ _NAME = f"{_DIM};padding-right:8px;vertical-align:top"
 _BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
 _SPARKLINE = "width:100%;max-width:320px;display:block;overflow:visible"
 _MAX_MERGE_LINES = 4  # newest merges
+_MAX_FULL = 4  # agents of which all is shown; of more, a line each
 
 
 @dataclass
@@ -37,6 +39,7 @@ class SidePanel:
         self._names: dict[str, str] = {}  # by run
         self._report = ev.AgentsReported()
         self._merges: deque[str] = deque(maxlen=_MAX_MERGE_LINES)
+        self._merge_count = 0
 
     @property
     def agents(self) -> dict[str, str]:
@@ -54,6 +57,7 @@ class SidePanel:
                     self._of(event.agent).decision = f"{event.event}: {event.reason}"
                 if event.event in ev.MERGES:
                     name_html = "" if event.agent is None else f" {event.agent}:"
+                    self._merge_count += 1
                     self._merges.append(f"{event.t_s:.1f} s {event.event}:{name_html} {event.reason}")
             case ev.AgentsReported():
                 self._report = event
@@ -64,15 +68,21 @@ class SidePanel:
         if self._report.left_out:
             text = f"{self._report.left_out} updates were dropped: this view is too slow"
             parts.append(f'<div style="color:{_BAD}">{text}</div>')
-        for label, agent in sorted(
-            self._report.agents.items(), key=lambda item: (has_left(item[1]), item[0])
-        ):
+        agents = sorted(self._report.agents.items(), key=_by_urgency)
+        present_count = sum(not has_left(agent) for _, agent in agents)
+        if present_count > _MAX_FULL:
+            parts.append(_counts([agent for _, agent in agents]))
+        for label, agent in agents:
             run = room.runs.get(agent["run"])
-            colour = (128, 128, 128) if run is None else room.colour(run)
-            parts.append(self._agent(label, agent, colour, room.corrections.get(agent["run"]), now_s))
+            swatch = "rgb({}, {}, {})".format(*((128, 128, 128) if run is None else room.colour(run)))
+            if present_count > _MAX_FULL or has_left(agent):
+                parts.append(_line(label, agent, swatch))
+            else:
+                parts.append(self._agent(label, agent, swatch, room.corrections.get(agent["run"]), now_s))
         if self._merges:
             lines = "".join(f"<div>{escape(line)}</div>" for line in reversed(self._merges))
-            parts.append(f'<div style="margin-top:8px"><b>merges</b>{lines}</div>')
+            more = "" if self._merge_count <= len(self._merges) else f", the newest of {self._merge_count}"
+            parts.append(f'<div style="margin-top:8px"><b>merges</b>{more}{lines}</div>')
         body = "".join(parts) or "no agent yet"
         return f'<div style="{_BODY}">{body}</div>'
 
@@ -80,11 +90,9 @@ class SidePanel:
         return self._history.setdefault(name, _AgentHistory())
 
     def _agent(
-        self, label: str, agent: Any, colour: Colour, corrected: LastCorrection | None, now_s: float
+        self, label: str, agent: Any, swatch: str, corrected: LastCorrection | None, now_s: float
     ) -> str:
         history, limit_ms = self._of(label), LIMITS[AgentKind(agent["kind"])].pose_ms
-        is_gone = has_left(agent)
-        state = "gone" if is_gone else agent["state"]
         ages = tuple(history.ages_ms)
         rate = "" if agent["rate_hz"] is None else f", at most {agent['rate_hz']:.1f} Hz"
         rows = [("keyframes", f"{agent['keyframes']}{rate}")]
@@ -102,20 +110,53 @@ class SidePanel:
         cells = "".join(
             f'<tr><td style="{_NAME}">{name}</td><td>{escape(value)}</td></tr>' for name, value in rows
         )
-        swatch = "rgb({}, {}, {})".format(*colour)
-        is_bad = is_lost(agent) or bool(agent["trouble"])
-        name_html = f"<b>{escape(label)}</b> {escape(agent['kind'])}"
-        state_colour = "inherit" if is_gone else _BAD if is_bad else _GOOD
-        state_html = f'<b style="color:{state_colour}">{escape(state)}</b>'
-        head = f'<div><span style="color:{swatch}">&#9632;</span> {name_html} {state_html}</div>'
-        if is_gone:
-            return f'<div style="opacity:.5;margin:0 0 10px">{head}</div>'
-        faults = "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
         decision = f'<div style="{_DIM}">{escape(history.decision)}</div>' if history.decision else ""
         return (
-            f'<div style="margin:0 0 10px">{head}{faults}{sparkline(ages, limit_ms, swatch)}'
-            f"<table>{cells}</table>{decision}</div>"
+            f'<div style="margin:0 0 10px">{_head(label, agent, swatch)}{_faults(agent)}'
+            f"{sparkline(ages, limit_ms, swatch)}<table>{cells}</table>{decision}</div>"
         )
+
+
+def _by_urgency(item: tuple[str, Any]) -> tuple[Any, ...]:
+    """Return a key that puts agents in trouble first, and who is gone last."""
+    label, agent = item
+    return has_left(agent), not agent["trouble"], natural_order(label)
+
+
+def _counts(agents: Sequence[Any]) -> str:
+    present = [agent for agent in agents if not has_left(agent)]
+    troubled = sum(bool(agent["trouble"]) for agent in present)
+    trouble = f'<span style="color:{_BAD}">{troubled} in trouble</span>' if troubled else ""
+    parts = [f"{len(present)} agents", trouble]
+    parts.append(f"{len(agents) - len(present)} gone" * (len(present) < len(agents)))
+    return f'<div style="margin:0 0 6px"><b>{", ".join(filter(None, parts))}</b></div>'
+
+
+def _head(label: str, agent: Any, swatch: str, more: str = "") -> str:
+    """Return an agent's name, kind and state. The state alone is not bad where something else is wrong."""
+    is_gone = has_left(agent)
+    state = "gone" if is_gone else agent["state"]
+    is_bad, is_good = is_lost(agent) and not is_gone, not is_gone and not agent["trouble"]
+    colour = _BAD if is_bad else _GOOD if is_good else "inherit"
+    return (
+        f'<div><span style="color:{swatch}">&#9632;</span> <b>{escape(label)}</b> {escape(agent["kind"])} '
+        f'<b style="color:{colour}">{escape(state)}</b>{more}</div>'
+    )
+
+
+def _faults(agent: Any) -> str:
+    return "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
+
+
+def _line(label: str, agent: Any, swatch: str) -> str:
+    """Return an agent on one line, and what is wrong with it below."""
+    if has_left(agent):
+        return f'<div style="opacity:.5">{_head(label, agent, swatch)}</div>'
+    figures = [] if agent["pose_ms"] is None else [_duration(agent["pose_ms"], 0)]
+    figures += [] if agent["qoe"] is None else [f"QoE {agent['qoe']:.2f}"]
+    figures.append(f"{agent['keyframes']} keyframes")
+    more = f' <span style="{_DIM}">{" · ".join(figures)}</span>'
+    return f"<div>{_head(label, agent, swatch, more)}{_faults(agent)}</div>"
 
 
 def _duration(ms: float, digits: int) -> str:

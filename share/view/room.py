@@ -7,6 +7,7 @@ often it changed since the last time, and only so many at a time: a viewer is ne
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +28,7 @@ from share.view.map_places import MapPlaces
 
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
 _MAX_CHUNKS = 12  # drawn at a time
+_MAX_ANNOUNCEMENTS = 3  # in `ANNOUNCED_S`; the panel counts the others
 _FLASH_S, _TEXT_S = 1.5, 8.0  # s, for which a new loop or correction, and a merge, are highlighted
 _LEAST_CORRECTION_M = 0.005  # m; smaller corrections are not drawn
 _FLOOR_STEP_M = 0.3  # a lower floor is not drawn again for less
@@ -64,6 +66,7 @@ class DrawnRoom:
         self._lows: dict[str, F64] = {}  # corner and floor of each chunk of keyframes: x, y, z, x, y
         self._floor: dr.FloorGrid | None = None
         self._announcements: list[dr.Announcement] = []
+        self._announced_s: deque[float] = deque(maxlen=_MAX_ANNOUNCEMENTS)
 
     # ------------------------------------------------------------------ events
 
@@ -196,7 +199,9 @@ class DrawnRoom:
         if event.event not in ev.MERGES:
             return
         title = event.event if event.agent is None else f"{event.event}: {event.agent}"
-        self._announcements.append(dr.Announcement(title, event.reason))
+        if len(self._announced_s) < _MAX_ANNOUNCEMENTS or now_s - self._announced_s[0] >= dr.ANNOUNCED_S:
+            self._announced_s.append(now_s)
+            self._announcements.append(dr.Announcement(title, event.reason))
         for run in reversed(self.runs.values()):
             if run.shown.name == event.agent and (place := run.place()) is not None:
                 position = place[1][:3, 3] + self._places.offset(place[0]) + (0.0, 0.0, 0.5)
@@ -296,10 +301,8 @@ class DrawnRoom:
         if (place := run.place()) is None:
             return None
         shown = run.shown
-        T, is_current = (
-            shifted(place[1], self._places.offset(place[0])),
-            run.state.has_pose and run.is_current,
-        )
+        T = shifted(place[1], self._places.offset(place[0]))
+        is_current = run.state.has_pose and run.is_current
         name, colour = f"/agents/{run.number}", self.colour(run)
         self._drawn.add(name)
         return dr.Body(

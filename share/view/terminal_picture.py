@@ -6,13 +6,14 @@ Pure: from the edge's report and plan (`/snapshot.json`, `/plan.json`) to lines 
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise
 from typing import Any
 
 import click
 
+from share.agent_names import natural_order
 from share.colours import Colour, agent_colour
 from share.errors import printable
 from share.protocol.agent_health import LIMITS, has_left, is_lost
@@ -25,6 +26,8 @@ _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))  # of a braille
 _BRAILLE = 0x2800
 _ARROWS = "→↗↑↖←↙↓↘"
 _BLOCKS = "▁▂▃▄▅▆▇█"
+_MAX_NAME = 20  # characters
+_LEAST_PLAN_COLUMNS = 24  # in which names fit
 _HISTORY = 16  # poses in a sparkline
 _MAX_STEPS = 100_000  # dots between the ends of all lines of a plan; it has some ten thousand dots
 _BAD: Colour = (229, 72, 77)
@@ -52,9 +55,7 @@ class TerminalPicture:
         for name, one in agents.items():
             if one.get("pose_ms") is not None:
                 self._ages_ms.setdefault(name, deque(maxlen=_HISTORY)).append(one["pose_ms"])
-        text = [self._figures_line(name, one, columns) for name, one in sorted(agents.items())]
-        troubles = [_trouble_line(name, one, columns) for name, one in sorted(agents.items())]
-        text = [*text, *filter(None, troubles)][: max(1, rows - 6)]
+        text = self._agent_lines(agents, columns, max(1, rows - 6))
         height = min(_MOST_PLAN_ROWS, rows - len(text) - 1)
         return [*self._plans(report, plan, columns, height), *text]
 
@@ -63,14 +64,38 @@ class TerminalPicture:
 
     # ------------------------------------------------------------------ a line for each agent
 
-    def _figures_line(self, name: str, agent: Report, columns: int) -> str:
+    def _agent_lines(self, agents: Report, columns: int, rows: int) -> list[str]:
+        """Return a line for each agent and one for what is wrong with it; of more than fit, who is in trouble
+        first, and how many are left out."""
+        names = sorted(agents, key=natural_order)
+        width = min(_MAX_NAME, max([10, *map(len, names)]))
+        troubled = [name for name in names if agents[name].get("trouble")]
+        needed = len(names) + len(troubled)
+        if needed <= rows:
+            lines = [self._figures_line(name, agents[name], width, columns) for name in names]
+            return [*lines, *(_trouble_line(name, agents[name], columns) for name in troubled)]
+        lines, shown = [], 0
+        for name in (*troubled, *(name for name in names if name not in troubled)):
+            block = [self._figures_line(name, agents[name], width, columns)]
+            if name in troubled:
+                block.append(_trouble_line(name, agents[name], columns))
+            if len(lines) + len(block) > rows - 1:
+                break
+            lines, shown = [*lines, *block], shown + 1
+        left_troubled = max(0, len(troubled) - shown)
+        line = _Line(columns)
+        line.add(f"and {len(names) - shown} more of {len(names)} agents, {left_troubled} of them in trouble")
+        return [*lines, line.text()]
+
+    def _figures_line(self, name: str, agent: Report, width: int, columns: int) -> str:
+        """Return how an agent fares. width: of its name, characters."""
         limit_ms = LIMITS[AgentKind(agent["kind"])].pose_ms
         state = str(agent.get("state") or "–")
-        is_bad = is_lost(agent) or bool(agent.get("trouble"))
         line = _Line(columns)
         line.add("■ ", self._colour(name))
-        line.add(f"{name[:10]:10} {agent['kind']:5} ")
-        line.add(f"{state[:12]:12} ", _BAD if is_bad else _GOOD)
+        line.add(f"{_shortened(name, width):{width}} {agent['kind']:5} ")
+        is_good = not agent.get("trouble")
+        line.add(f"{state[:12]:12} ", _BAD if is_lost(agent) else _GOOD if is_good else None)
         pose_ms, ages_ms = agent.get("pose_ms"), self._ages_ms.get(name, ())
         line.add(f"{_fixed(pose_ms, 1):>6} ", _BAD if (pose_ms or 0) > limit_ms else None)
         line.add(f"of {limit_ms:3.0f} ms  ")
@@ -85,15 +110,18 @@ class TerminalPicture:
     # ------------------------------------------------------------------ plans
 
     def _plans(self, report: Report, plan: Report, columns: int, rows: int) -> list[str]:
-        """Return plans of all maps beside each other, each under its own scale, and a line of captions."""
+        """Return plans of maps beside each other, each under its own scale, and a line of captions. Of more
+        than there is room for, those in which the most agents are."""
         agents = _with_presence(plan.get("agents", {}), report.get("agents", {}))
         ids = list(dict.fromkeys(part["map_id"] for one in agents.values() for part in one["parts"]))
         if not ids or rows < 3:
             return []
-        width = max(8, columns // len(ids) - 1)
-        shown = ids[: max(1, columns // (width + 1))]
-        drawn = [self._plan(map_id, agents, width, rows - 1) for map_id in shown]
-        return [" ".join(parts) for parts in zip(*drawn, strict=True)]
+        members = Counter(one["map_id"] for one in agents.values() if one.get("position"))
+        shown = sorted(ids, key=lambda map_id: -members[map_id])[: max(1, columns // _LEAST_PLAN_COLUMNS)]
+        more = [f"and {len(ids) - len(shown)} more maps"] if len(shown) < len(ids) else []
+        width = columns // len(shown) - 1
+        drawn = [self._plan(map_id, agents, width, rows - 1 - len(more)) for map_id in shown]
+        return [*(" ".join(parts) for parts in zip(*drawn, strict=True)), *more]
 
     def _plan(self, map_id: str, agents: Report, width: int, rows: int) -> list[str]:
         """Return `rows` lines and a caption, each `width` characters wide."""
@@ -112,7 +140,7 @@ class TerminalPicture:
                 canvas.draw_path(path, self._colour(name))
         for name, one in here.items():
             canvas.draw_agent(name, one, _BAD if one["is_lost"] else self._colour(name))
-        caption = f"map of {', '.join(here) or 'no agent now'}, {canvas.metres_wide:.0f} m wide"
+        caption = _map_caption(sorted(here, key=natural_order), f", {canvas.metres_wide:.0f} m wide", width)
         return [*canvas.lines(), f"{printable(caption[:width]):{width}}"]
 
 
@@ -126,13 +154,25 @@ def _with_presence(plans: Report, agents: Report) -> dict[str, Any]:
     return out
 
 
+def _map_caption(names: Sequence[str], scale: str, width: int) -> str:
+    """Return who is in a map and how wide it is; of more names than fit, how many there are."""
+    for count in range(len(names), 0, -1):
+        more = f" and {len(names) - count} more" if count < len(names) else ""
+        if len(caption := f"map of {', '.join(names[:count])}{more}{scale}") <= width:
+            return caption
+    return f"map of {len(names)} agents{scale}" if names else f"map of no agent now{scale}"
+
+
 def _trouble_line(name: str, agent: Report, columns: int) -> str:
-    """Return what is wrong with an agent; empty if nothing is."""
-    if not (troubles := "; ".join(agent.get("trouble") or ())):
-        return ""
+    """Return what is wrong with an agent."""
     line = _Line(columns)
-    line.add(f"  {name[:10]}: {troubles}", _BAD)
+    line.add(f"  {_shortened(name, _MAX_NAME)}: {'; '.join(agent['trouble'])}", _BAD)
     return line.text()
+
+
+def _shortened(name: str, width: int) -> str:
+    """Return a name that is no wider; a cut one says so, and keeps its end, in which names differ."""
+    return name if len(name) <= width else f"{name[: width - 7]}…{name[-6:]}"
 
 
 class _Line:
@@ -182,7 +222,7 @@ class _Canvas:
         turn = round(4 * (agent.get("heading") or 0.0) / math.pi) % 8
         mark = "●" if agent["kind"] == AgentKind.ROBOT else _ARROWS[turn]
         mark = "✕" if agent["is_lost"] else mark
-        text = f"{mark} {name}"
+        text = f"{mark} {_shortened(name, self._width - 2)}"
         column = min(column, max(0, self._width - len(text)))
         for k, letter in enumerate(text[: self._width]):
             self._marks[row, column + k] = letter if letter.isprintable() else "?"

@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from typing import Any
 
+from share.agent_names import natural_order
 from share.errors import ShareError, UsageError
 from share.net.http_guard import HttpGuard, http_address, listen
 from share.net.transport import Address
@@ -165,7 +166,8 @@ class Viewer:
         self._window.follow(lambda name: self._place(agents, name))
         if now_s >= self._panel_due_s:
             self._panel_due_s = now_s + _PANEL_S
-            self._window.show_panel(self._panel.html(self._room, now_s), sorted(agents.values()))
+            followed = sorted(agents.values(), key=natural_order)
+            self._window.show_panel(self._panel.html(self._room, now_s), followed)
 
     def _place(self, agents: Mapping[str, str], name: str) -> Any:
         run = next((run for run, label in agents.items() if label == name), None)

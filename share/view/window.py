@@ -157,7 +157,7 @@ class Window:
                 self._server.scene.remove_by_name(one.name)
             case dr.Announcement():
                 for client in self._server.get_clients().values():
-                    client.add_notification(one.title, one.text, auto_close_seconds=6.0)
+                    client.add_notification(one.title, one.text, auto_close_seconds=dr.ANNOUNCED_S)
 
     def _draw_marks(self, marks: dr.Marks) -> None:
         upright = np.tile((1.0, 0.0, 0.0, 0.0), (len(marks.positions), 1))

@@ -717,6 +717,12 @@ def test_port_in_use_is_reported(share, tmp_path):
     )
 
 
+def test_pages_of_an_edge_do_not_share_a_port(share, tmp_path):
+    """It was told to stop the other edge, and there was none."""
+    done = share("edge", "--http", "8093", "--view", "8093", "--out", tmp_path / "out")
+    assert complaint(done, 2) == "share: --http and --view name the same port 8093; give each its own\n"
+
+
 def test_edge_with_a_full_disk_continues(room, share, tmp_path):
     """A limit on file size stands for the disk."""
     out = tmp_path / "edge"

@@ -310,7 +310,13 @@ def test_progress_is_shown_on_terminals_only(small, tmp_path):
         pass
     assert maker.wait() == 0
     text = shown.decode()
-    for stage in ("planning", "making the room", "metering walk1", "drawing images", "writing recordings"):
+    for stage in (
+        "planning",
+        "making the room",
+        "setting the exposure of walk1",
+        "drawing images",
+        "writing recordings",
+    ):
         bars = [bar for bar in text.replace("\r", "\n").split("\n") if stage in bar]
         assert bars, stage
         assert "100%" in bars[-1], bars[-1]

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -430,6 +431,10 @@ def test_places_in_all_segments_of_a_map_count(ann: Walker, bob: Walker) -> None
     decisions = [atlas.propose(x) for x in seen]
     assert [d.accepted for d in decisions] == [False] * 4 + [True]
     assert "5 of 5 required places agree" in decisions[-1].reason
+    assert re.match(
+        r"map \S+ merged into \S+: keyframe \d+ of \S+ and keyframe \d+ of \S+ see the same place; 5 of 5",
+        decisions[-1].reason,
+    )
     assert atlas.map_sizes().keys() == {"ann/0"}
 
 

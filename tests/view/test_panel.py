@@ -50,7 +50,7 @@ def test_it_says_of_an_agent_what_decides() -> None:
 
 
 def test_trouble_and_decisions_are_said_with_their_reason() -> None:
-    late = AGENT | {"trouble": ["poses come 3.4 s, limit 20 ms"]}
+    late = AGENT | {"trouble": ["poses are 3.4 s old, limit 20 ms"]}
     text = words(
         panel_of(
             ev.AgentsReported({"ann": late}, ("the disk is full",), left_out=7),
@@ -59,7 +59,7 @@ def test_trouble_and_decisions_are_said_with_their_reason() -> None:
         )
     )
     for part in (
-        "poses come 3.4 s, limit 20 ms",
+        "poses are 3.4 s old, limit 20 ms",
         "the disk is full",
         "7 updates were dropped: this view is too slow",
     ):
@@ -96,3 +96,32 @@ def test_long_times_are_in_seconds() -> None:
     late = AGENT | {"pose_ms": 19_233.7, "delay_ms": 136_871.0}
     text = words(panel_of(ev.AgentsReported({"ann": late})))
     assert "19.2 s, limit 20 ms" in text and "136.9 s" in text and "19233" not in text
+
+
+def many(count: int, **troubles: list[str]) -> ev.AgentsReported:
+    names = [f"agent{k}" for k in range(count)]
+    return ev.AgentsReported({n: AGENT | {"run": f"{n}-1", "trouble": troubles.get(n, [])} for n in names})
+
+
+def test_of_many_agents_there_is_a_line_each_the_troubled_first_and_counts() -> None:
+    report = many(30, agent17=["its clock is not synchronised: unknown"])
+    html = panel_of(report)
+    text = words(html)
+    assert "30 agents, 1 in trouble" in text.replace(" ,", ",")
+    names = re.findall(r"<b>(agent\d+)</b>", html)
+    assert names == ["agent17", *(f"agent{k}" for k in range(30) if k != 17)]  # agent2 before agent10
+    assert html.count("<table>") == 0 and len(html) < 30 * 400
+    assert panel_of(many(4)).count("<table>") == 4
+
+
+def test_a_state_that_is_good_is_not_red_for_another_trouble() -> None:
+    html = panel_of(ev.AgentsReported({"ann": AGENT | {"trouble": ["its clock is not synchronised"]}}))
+    assert '<b style="color:inherit">OK</b>' in html
+    lost = panel_of(ev.AgentsReported({"ann": AGENT | {"state": "LOST", "trouble": ["LOST: dark"]}}))
+    assert '<b style="color:#e5484d">LOST</b>' in lost
+
+
+def test_merges_that_are_not_listed_are_counted() -> None:
+    merges = [ev.DecisionMade(float(k), "maps merged", "ann", f"number {k}") for k in range(9)]
+    text = words(panel_of(*merges))
+    assert "the newest of 9" in text and "number 8" in text and "number 4" not in text

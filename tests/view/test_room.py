@@ -13,6 +13,7 @@ from share.types import F64, AgentKind, TrackState
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import KEYFRAMES_PER_CHUNK, PATH_POINTS_PER_CHUNK
+from share.view.map_places import MapPlaces
 from share.view.room import DrawnRoom
 
 POINTS = np.random.default_rng(1).uniform(1, 3, (20, 3)).astype(np.float32)
@@ -202,9 +203,19 @@ def test_a_second_map_within_a_chunk_takes_no_place_away() -> None:
     told(room, pose("bob", 1, 0.0))
     (points,) = of(told(room, corrected("ann", "A", at(0.0, 1.0))), "/points")  # only ann's moves
     assert isinstance(points, dr.Points) and points.name.startswith("/points/0/")
-    assert [room._places.offset(one)[1] for one in ("A", "B", "B2")] == [0.0, 10.0, 20.0]
+    offsets = [room._places.offset(one)[:2].tolist() for one in ("A", "B", "B2")]
+    assert offsets == [[0.0, 0.0], [0.0, 10.0], [10.0, 10.0]]
     place = room.agent_place("bob-1")
-    assert place is not None and place[1, 3] == 20.0
+    assert place is not None and place[:2, 3].tolist() == [11.0, 10.0]
+
+
+def test_many_maps_stand_in_a_square_each_at_a_place_of_its_own() -> None:
+    places = MapPlaces()
+    for k in range(30):
+        places.put(KeyframeKey("ann-1", k), f"map {k}")
+    offsets = np.array([places.offset(f"map {k}")[:2] for k in range(30)])
+    assert len(np.unique(offsets, axis=0)) == 30
+    assert np.ptp(offsets, axis=0).max() <= 50.0
 
 
 def test_a_map_without_a_keyframe_gives_its_place_up() -> None:
@@ -388,3 +399,12 @@ def test_what_happens_while_nobody_looks_is_drawn_later_and_what_was_shown_for_a
         drawings += room.take_drawings(1e3)
     assert {"/points/0/0", "/loops/0"} <= names(drawings)
     assert not of(drawings, "/loops/new") and dr.Announcement.__name__ not in names(drawings)
+
+
+def test_of_merges_that_come_together_three_are_announced() -> None:
+    """Thirty notices run off the page."""
+    room = two_maps()
+    merges = [ev.DecisionMade(1.0, "maps merged", "ann", f"merge {k}") for k in range(30)]
+    assert sum(isinstance(one, dr.Announcement) for one in told(room, *merges, now_s=10.0)) == 3
+    assert not any(isinstance(one, dr.Announcement) for one in told(room, merges[0], now_s=13.0))
+    assert any(isinstance(one, dr.Announcement) for one in told(room, merges[0], now_s=16.5))

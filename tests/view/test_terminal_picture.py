@@ -129,3 +129,31 @@ def test_an_agent_keeps_the_colour_of_its_coming_however_late_one_looks() -> Non
     lines = TerminalPicture().lines({"agents": agents}, {"agents": {}}, COLUMNS, 24)
     swatches = [click.style("■ ", fg=agent_colour(number)) for number in (1, 0)]
     assert [line[: len(swatch)] for line, swatch in zip(lines, swatches, strict=True)] == swatches
+
+
+def test_names_of_many_agents_stay_whole_and_in_their_order() -> None:
+    names = [f"agent{k}" for k in range(12)]
+    report = {"agents": {name: agent() for name in names}}
+    plan = {"agents": {name: place(EAST, map_id=name) for name in names}}
+    lines = drawn(report, plan, columns=72, rows=40)
+    assert [line.split()[1] for line in lines if line.startswith("■")] == names  # agent2 before agent10
+    caption = next(line for line in lines if line.startswith("map of"))
+    assert caption.count("map of agent") == caption.count("m wide") == 3 and len(caption) <= 72
+    assert "and 9 more maps" in lines
+    long = "headset-of-the-third-floor-"
+    both = {"agents": {f"{long}{k}": agent() for k in (1, 2)}}
+    assert len({line.split()[1] for line in drawn(both, {"agents": {}})}) == 2
+
+
+def test_of_agents_that_do_not_fit_the_troubled_are_shown_and_the_others_counted() -> None:
+    agents = {f"agent{k}": agent() for k in range(30)}
+    agents["agent27"] = agent(state="OK", trouble=["its clock is not synchronised"])
+    lines = drawn({"agents": agents}, {"agents": {}}, rows=18)
+    assert "agent27" in lines[0] and "its clock" in lines[1]
+    assert lines[-1] == "and 20 more of 30 agents, 0 of them in trouble" and len(lines) <= 18
+
+
+def test_a_good_state_is_not_red_for_another_trouble() -> None:
+    report = {"agents": {"ann": agent(trouble=["its clock is not synchronised"])}}
+    line = TerminalPicture().lines(report, {"agents": {}}, COLUMNS, ROWS)[0]
+    assert "\x1b[38;2;229;72;77m" not in line

@@ -113,7 +113,7 @@ def _metered_exposures(
     values: dict[int, F64] = {}
     for job, brightness in pool.run(drawing.measure_brightness, jobs):
         values[int(job.true_ns[0])] = brightness
-        progress(f"metering {actor.name}", len(values), len(jobs))
+        progress(f"setting the exposure of {actor.name}", len(values), len(jobs))
     whole = np.concatenate([values[key] for key in sorted(values)])
     data = BytesIO()
     np.save(data, whole)

@@ -23,7 +23,10 @@ from share.lab.evaluate.trial import Trial
 
 _HEADLINE = ("AR latency", "merges per metre", "joint ATE")  # measures in the first sentence
 _INTERVAL_NOTE = "95 %: confidence intervals by bootstrap over sessions, each with all its runs."
-_VALUES_NOTE = "Means over runs that have a value; the best of each row in bold."
+_VALUES_NOTE = (
+    "Means over runs that have a value; the best of a row in bold, unless all are equal or neither more nor "
+    "less is better (estimated errors, keyframes sent)."
+)
 _RATIOS_NOTE = "Ratios over pairs of runs of equal session, link and seed."
 _Comparisons = Mapping[str, Sequence[PolicyComparison]]  # by policy, in the order of `MEASURES`
 
@@ -50,7 +53,7 @@ def markdown(
     names = policy_names(runs)
     compared = {name: compare_policies(runs, name, base) for name in names}
     other_policies = [name for name in names if name != base]
-    parts = ["# Policies compared", _headline(compared, base)]
+    parts = ["# Policies compared", _headline(compared, base), _meetings(runs, names)]
     if failed:
         parts.append(f"FAILED, and not in this report: {', '.join(failed)}.")
     parts += ["## Each policy", _values(compared), _VALUES_NOTE]
@@ -59,7 +62,10 @@ def markdown(
         parts += [f"## Ratios to `{base}`", _ratios(compared, other_policies), note, pictures.comparison]
         subject = other_policies[0]  # of the first, in whatever order they are named
         others = [name for name in names if name != subject]
-        parts += [f"## Errors with `{subject}`", *(_win_counts(runs, subject, other) for other in others)]
+        parts += [
+            f"## Errors with `{subject}`",
+            "\n".join(_win_count(runs, subject, other) for other in others),
+        ]
     parts += ["## Every agent", pictures.agents]
     for title, field in (("Latency, ms", "latency_ms"), ("ATE in the map, cm", "ate_cm")):
         if table := _agent_table(runs, names, field):
@@ -83,6 +89,23 @@ def _headline(compared: _Comparisons, base: str) -> str:
             f"{format_number(mine.ratio.value, '.2f')} of `{base}`'s"
         )
     return f"**`{subject}`: {'; '.join(sentences)}, in the same runs.**" if sentences else ""
+
+
+def _meetings(runs: Sequence[RunMetrics], names: Sequence[str]) -> str:
+    """Return in how many runs agents came to share a map; "" where they did in all."""
+    met = {
+        name: [run.agents_in_largest_map >= 2 for run in runs if run.conditions.policy == name]
+        for name in names
+    }
+    if all(map(all, met.values())):
+        return ""
+    if not any(map(any, met.values())):
+        return (
+            f"**No agents met in any of the {len(runs)} runs, so no map was shared:** this report says "
+            "nothing of merges and of errors in a shared map. Longer sessions, or paths that cross, would."
+        )
+    counts = ", ".join(f"{sum(of)} of {len(of)} with `{name}`" for name, of in met.items())
+    return f"Agents came to share a map in not all runs: {counts}."
 
 
 def _known_measures(compared: _Comparisons) -> list[tuple[int, Measure]]:
@@ -143,12 +166,17 @@ def _bounds(interval: Interval) -> str:
     return "–" if math.isnan(interval.low) else f"{interval.low:.2f} to {interval.high:.2f}"
 
 
-def _win_counts(runs: Sequence[RunMetrics], name: str, other: str) -> str:
+def _win_count(runs: Sequence[RunMetrics], name: str, other: str) -> str:
     wins, total = count_no_worse(runs, name, other)
+    if not total:
+        return (
+            f"* against `{other}`: no agent was in a shared map with both, so there are no errors to compare"
+        )
     means, total_means = count_no_worse_on_average(runs, name, other)
     return (
-        f"* at most those with `{other}` in {wins} of {total} runs of an agent (in the shared map with "
-        f"both), and in {means} of {total_means} means over an agent's runs on a session"
+        f"* against `{other}`: {wins} of {total} ATEs in the shared map are no larger (an agent's, in runs "
+        f"in which it shared a map with both), and {means} of {total_means} of their means over an agent's "
+        "runs on a session"
     )
 
 

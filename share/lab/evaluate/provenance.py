@@ -30,6 +30,13 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
+def busy_text(load: float, cores: int, run: str) -> str:
+    """Return a line where other programs kept the machine busy before `run`; "" where they did not."""
+    if load <= 0.5 * cores:
+        return ""
+    return f"other programs kept this machine busy (load {load:g} on {cores} cores before {run})"
+
+
 def _cpu_name() -> str | None:
     """Return the CPU's model name from /proc/cpuinfo, None if absent."""
     path = Path("/proc/cpuinfo")

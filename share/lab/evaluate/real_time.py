@@ -56,7 +56,7 @@ Processes = dict[str, subprocess.Popen[bytes]]
 class Progress:
     """Progress of a run, for the live line: frames per agent, agents that share a map, corrections sent.
 
-    merges: a line for each merge of maps so far.
+    merges: a line for each merge of maps so far; its time is since the first agent joined.
     """
 
     frames: dict[str, int]
@@ -208,17 +208,21 @@ class _RunMonitor:
         self._frames = dict.fromkeys(folders, 0)
         self._events, self._corrections, self._membership = GrowingFile(events), 0, MapMembership()
         self._merges: tuple[str, ...] = ()
+        self._first_s: float | None = None  # when the first agent joined, as in `join_times`
 
     def progress(self) -> Progress:
         for name, file in self._odometry.items():
             self._frames[name] += len(file.new_lines())
         for line in self._events.new_lines():
             event = json.loads(line)
+            if event["event"] == "agent joined" and self._first_s is None:
+                self._first_s = event["t_s"]
             if event["event"] == "correction":
                 self._corrections += 1
                 self._membership.add_correction(event["agent"], event["map_id"])
             elif event["event"] in _MERGE_EVENTS:
-                text = f"{event['t_s']:7.1f} s {event['event']}: {event['agent']}: {event['reason']}"
+                since_s = event["t_s"] - (self._first_s or 0.0)
+                text = f"{since_s:7.1f} s {event['event']}: {event['agent']}: {event['reason']}"
                 self._merges = (*self._merges, text)
         sharing = len(self._membership.sharing_agents)
         return Progress(dict(self._frames), sharing, self._corrections, self._merges)

@@ -32,12 +32,21 @@ _RATIO_MEASURES = (
 def draw_report(
     folder: Path, runs: Sequence[RunMetrics], trials: Sequence[Trial], base: str
 ) -> ReportPictures:
-    """Write PNG files to `folder`; return the Markdown that shows them. trials: in the order of `runs`."""
+    """Write PNG files to `folder`; return the Markdown that shows them. trials: in the order of `runs`.
+
+    A chart without a value is left out."""
     names, sessions = policy_names(runs), list(dict.fromkeys(run.conditions.session for run in runs))
     agents = list(dict.fromkeys(agent.agent for run in runs for agent in run.agents))
-    for file, field, unit, line in (
-        ("latency.png", "latency_ms", "ms", NOTICEABLE_LATENCY_MS),
-        ("ate.png", "ate_cm", "cm", None),
+    drawn = {}
+    for caption, file, field, unit, line in (
+        (
+            "Latency of each agent; the line is at 20 ms",
+            "latency.png",
+            "latency_ms",
+            "ms",
+            NOTICEABLE_LATENCY_MS,
+        ),
+        ("ATE of each agent in the shared map", "ate.png", "ate_cm", "cm", None),
     ):
         panels = {
             agent: {
@@ -46,16 +55,13 @@ def draw_report(
             }
             for agent in agents
         }
-        draw_bars(folder / file, panels, sessions, unit, line)
+        known = {agent: of for agent, of in panels.items() if np.isfinite(list(of.values())).any()}
+        (folder / file).unlink(missing_ok=True)  # of an earlier report
+        if known:
+            draw_bars(folder / file, known, sessions, unit, line, names)
+            drawn[caption] = file
     return ReportPictures(
-        _draw_ratios(folder, runs, names, base),
-        _image_links(
-            {
-                "Latency of each agent; the line is at 20 ms": "latency.png",
-                "ATE of each agent in the shared map": "ate.png",
-            }
-        ),
-        _draw_timeline(folder, trials),
+        _draw_ratios(folder, runs, names, base), _image_links(drawn), _draw_timeline(folder, trials)
     )
 
 
@@ -69,7 +75,8 @@ def _draw_ratios(folder: Path, runs: Sequence[RunMetrics], names: Sequence[str],
         for name in names
         if name != base
     }
-    if not compared:
+    (folder / "parts.png").unlink(missing_ok=True)  # of an earlier report
+    if not any(np.isfinite(one.value) for ratios in compared.values() for one in ratios.values()):
         return ""
     draw_ratios(folder / "parts.png", compared, base)
     has_intervals = any(np.isfinite(one.low) for ratios in compared.values() for one in ratios.values())
@@ -82,7 +89,8 @@ def _image_links(files: Mapping[str, str]) -> str:
 
 
 def draw_sessions(folder: Path, trials: Sequence[Trial]) -> list[Path]:
-    """Write three PNG files a session to `folder`: its runs over time, named after their folders."""
+    """Write PNG files to `folder`, two a session and a third where maps were merged: its runs over time,
+    named after their folders."""
     by_session: dict[Path, dict[str, Trial]] = {}
     for trial in trials:
         by_session.setdefault(trial.session.folder, {})[trial.folder.resolve().name] = trial
@@ -125,7 +133,10 @@ def _draw_over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> d
     draw_lines(over_time, panels, "s", units)
     merges_of = {name: merge_locations(trial) for name, trial in trials.items()}
     counted = {name: (of.metres, np.arange(1.0, len(of.metres) + 1)) for name, of in merges_of.items()}
-    draw_lines(merges_file, {f"merges on {session_name}": counted}, "path of all agents [m]", [""])
+    merges_file.unlink(missing_ok=True)  # of an earlier report
+    has_merges = any(len(of.metres) for of in merges_of.values())
+    if has_merges:
+        draw_lines(merges_file, {f"merges on {session_name}": counted}, "path of all agents [m]", [""])
     top_views = {
         f"{name}: {len(merges_of[name].metres)} merges": _top_view(trial, merges_of[name])
         for name, trial in trials.items()
@@ -133,7 +144,7 @@ def _draw_over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> d
     draw_paths(top_view_file, top_views)
     return {
         f"QoE and allowed keyframe rate over time: {session_name}": over_time,
-        f"Merges over distance: {session_name}": merges_file,
+        **({f"Merges over distance: {session_name}": merges_file} if has_merges else {}),
         f"Paths and merges from above: {session_name}; dots: merges after an agent's keyframe": top_view_file,
     }
 

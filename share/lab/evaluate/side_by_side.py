@@ -15,6 +15,7 @@ from share.colours import series_colours
 from share.geometry.interpolation import associate
 from share.geometry.se3 import transform
 from share.lab.evaluate.charts import agg_pyplot, save_png
+from share.lab.evaluate.provenance import busy_text
 from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.scoring import SessionScore, join_times, merge_locations, run_metrics, score_session
 from share.lab.evaluate.statistics import MEASURES
@@ -84,6 +85,13 @@ def headline(scored: Sequence[ScoredTrial]) -> str:
     )
 
 
+def busy_note(scored: Sequence[ScoredTrial]) -> str:
+    """Return a line where other programs took the cores from what is measured; "" where they did not."""
+    machine = scored[0].trial.record["machine"]
+    busy = busy_text(machine["load"], machine["cores"], "the first run")
+    return f"{busy}: latencies are not those of the policies; repeat it when idle" if busy else ""
+
+
 def _number(value: float) -> str:
     if math.isnan(value):
         return "–"
@@ -139,7 +147,7 @@ def draw_side_by_side(path: Path, scored: Sequence[ScoredTrial]) -> None:
         axis.grid(alpha=0.3)
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
-    figure.suptitle(headline(scored))
+    figure.suptitle("\n".join(filter(None, (headline(scored), busy_note(scored)))))
     save_png(figure, path, 110)
 
 
@@ -150,8 +158,9 @@ def _draw_latency(axis: Any, one: ScoredTrial, colour: str) -> None:
     for k, (what, style) in enumerate((("poses", "-"), ("corrections", ":"))):
         values = np.sort(np.concatenate([part[k] for part in parts]))
         if len(values):
-            of_all = 100 * np.arange(1, len(values) + 1) / len(values)
-            axis.plot(values, of_all, style, color=colour, linewidth=2, label=f"{one.policy}: {what}")
+            of_all = 100 * np.arange(len(values) + 1) / len(values)
+            steps, label = [values[0], *values], f"{one.policy}: {what} ({len(values)})"
+            axis.step(steps, of_all, style, where="post", color=colour, linewidth=2, label=label)
 
 
 def _latencies_ms(path: Path) -> tuple[F64, F64]:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from share.lab.evaluate import report_charts
 from share.lab.evaluate.policy_report import best_in_bold, latex_table, markdown
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
 from share.lab.evaluate.statistics import (
@@ -62,7 +63,32 @@ def test_errors_are_those_of_the_first_policy_beside_the_base():
     for runs in (RUNS, RUNS[1:] + RUNS[:1]):
         text = markdown(runs, TRIALS, "covins-g")
         assert "## Errors with `share`" in text
-        assert "at most those with `covins-g` in 2 of 3 runs" in text
+        assert "against `covins-g`: 2 of 3 ATEs in the shared map are no larger" in text
+        assert "share a map" not in text.replace("in which it shared a map", "")  # as they did in all runs
+
+
+def unmet(of: RunMetrics) -> RunMetrics:
+    """The run, if its agents had not met."""
+    agents = tuple(dataclasses.replace(one, ate_cm=NAN) for one in of.agents)
+    return dataclasses.replace(of, agents=agents, agents_in_largest_map=0, joint_ate_cm=NAN, merges_done=0)
+
+
+def test_the_report_says_where_agents_never_met():
+    text = markdown([unmet(one) for one in RUNS[:2]], TRIALS[:1], "covins-g")
+    assert "**No agents met in any of the 2 runs, so no map was shared:**" in text
+    assert "0 of 0" not in text and "there are no errors to compare" in text
+    half = markdown([RUNS[0], unmet(RUNS[1])], TRIALS[:1], "covins-g")
+    assert "share a map in not all runs: 1 of 1 with `covins-g`, 0 of 1 with `share`" in half
+
+
+def test_charts_without_a_value_are_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(report_charts, "_draw_timeline", lambda folder, trials: "")
+    (tmp_path / "ate.png").write_bytes(b"of an earlier report")
+    pictures = report_charts.draw_report(tmp_path, [unmet(one) for one in RUNS[:2]], TRIALS, "covins-g")
+    assert {path.name for path in tmp_path.iterdir()} == {"latency.png", "parts.png"}
+    assert "latency.png" in pictures.agents and "ate.png" not in pictures.agents
+    pictures = report_charts.draw_report(tmp_path, RUNS[:2], TRIALS, "covins-g")
+    assert (tmp_path / "ate.png").is_file() and "ate.png" in pictures.agents
 
 
 def found(policy: str) -> dict[str, tuple[float, float]]:
