@@ -154,7 +154,6 @@ def _line(label: str, agent: Any, swatch: str) -> str:
         return f'<div style="opacity:.5">{_head(label, agent, swatch)}</div>'
     figures = [] if agent["pose_ms"] is None else [_duration(agent["pose_ms"], 0)]
     figures += [] if agent["qoe"] is None else [f"QoE {agent['qoe']:.2f}"]
-    figures.append(f"{agent['keyframes']} keyframes")
     more = f' <span style="{_DIM}">{" · ".join(figures)}</span>'
     return f"<div>{_head(label, agent, swatch, more)}{_faults(agent)}</div>"
 

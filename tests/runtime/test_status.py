@@ -292,7 +292,7 @@ def test_the_page_needs_nothing_from_elsewhere():
     with serving() as server:
         status, headers, body = get(server, "/")
     page = body.decode()
-    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 16384
+    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 24 * 1024
     assert not re.search(r"https?://|(src|href)=|innerHTML|@import|url\(", page)
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert 'fetch("snapshot.json"' in page
