@@ -173,10 +173,11 @@ function planOfMap(id, agents) {
 function showPlan(plan) {
   const ids = [...new Set(entries(plan.agents).flatMap(([, a]) => a.parts.map(p => p.map_id)))];
   const figures = ids.map(id => planOfMap(id, plan.agents)).filter(Boolean);
-  at("plan").replaceChildren(...(figures.length ? figures : [node("span", "no path yet", "none")]));
+  if (!figures.length) figures.push(node("span", loading || "no path yet", "none"));
+  at("plan").replaceChildren(...figures);
 }
 
-let reported = {};  // agents of the newest report
+let reported = {}, loading;  // agents of the newest report; that a map is read
 const hasLeft = a => a.gone && !a.trouble?.length;  // else it went without a bye, not long ago
 const isLost = a => !hasLeft(a) && ["LOST", "SILENT"].includes(a.state);
 const isStale = a => !hasLeft(a) && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
@@ -233,7 +234,9 @@ function show(now) {
   const warnings = degraded.length ? ["degraded"] : [];
   if (stale) warnings.push(`${agentCount(stale)} without a current pose`);
   if (quarantined) warnings.push(`${agentCount(quarantined)} quarantined`);
-  mark(trouble.length ? "trouble" : warnings.join(", ") || "ok", trouble.length || warnings.length);
+  loading = now.loading;
+  const words = warnings.join(", ") || loading || "ok";
+  mark(trouble.length ? "trouble" : words, trouble.length || warnings.length);
   at("trouble").replaceChildren(...trouble.concat(degraded, now.refused ?? []).map(t => node("li", t)));
   const about = [`up ${duration(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${text(now.waiting)}`);
