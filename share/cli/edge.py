@@ -152,7 +152,7 @@ class _EdgePages:
 
     def _report(self) -> dict[str, Any]:
         """Return the report of the edge, if it runs yet, with the address of a live room that lives."""
-        report = {} if self.run is None else self.run.report()
+        report = {"loading": "starting"} if self.run is None else self.run.report()
         if self._room is None or not self._room.is_alive:
             return report
         return report | {"live_room": self._room.endpoint}
