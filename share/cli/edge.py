@@ -250,7 +250,7 @@ class _EdgePages:
 
     def _report(self) -> dict[str, Any]:
         """Return the report of the edge, if it runs yet, with what its pages tell that live."""
-        report = {} if self.run is None else self.run.report()
+        report = {"loading": "starting"} if self.run is None else self.run.report()
         if self._room is not None and self._room.is_alive:
             report = report | {"live_room": self._room.endpoint}
         if self._headset is not None and self._headset.is_alive:

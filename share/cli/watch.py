@@ -11,7 +11,7 @@ import click
 
 from share.cli import options
 from share.cli.terminal import LiveLine
-from share.errors import ShareError, UsageError
+from share.errors import ShareError, UsageError, printable
 
 _PERIOD_S, _TIMEOUT_S = 0.5, 2.0
 _MAX_ROWS = 200  # printed where no terminal is
@@ -53,7 +53,9 @@ def watch(address: str, http_token: Path | None, once: bool, as_json: bool) -> N
         return
     if once or not has_room(live):
         lines = room_lines(picture, report, plan, _MAX_ROWS)
-        click.echo("\n".join(lines) if any(lines) else f"{url}: no agent has come yet")
+        click.echo(
+            "\n".join(lines) if any(lines) else f"{url}: {report.get('loading') or 'no agent has come yet'}"
+        )
         return
     answered_s = time.monotonic()
     try:
@@ -98,6 +100,8 @@ def _last_line(url: str, report: dict[str, Any], silent_s: float) -> str:
         return f"{url} has not answered for {silent_s:.0f} s; this is what it said last"
     if troubles := report.get("trouble"):
         return f"the edge: {troubles[0]}"
+    if loading := report.get("loading"):
+        return f"{url} is {printable(str(loading))}"
     minutes, seconds = divmod(int(report.get("uptime_s") or 0), 60)
     merges = (report.get("merges") or {}).get("done", 0)
     return f"{url} up {minutes}:{seconds:02d} min, policy {report.get('policy')}, {merges} merges"

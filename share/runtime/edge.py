@@ -196,6 +196,7 @@ class EdgeRun:
             "agent_trouble": trouble_lines(report["agents"]),
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
             **self._progress.last_solve(),
+            **self._restarts.loading(),
         }
         self._reported_s = now
 

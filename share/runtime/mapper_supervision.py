@@ -38,7 +38,7 @@ class MapperRestarts:
         self.objects: Sequence[SaveObject] | None = None  # of the room; None before the map was loaded
         self._known_m, self._notify, self._has_keys = known_m, notify, has_keys
         self._backoff = Backoff(time.monotonic_ns())
-        self._is_restoring = False
+        self._is_restoring, self._restored_keyframes = False, 0
         self._tries = 0
         self._copies = [] if store is None else [copy.name for copy in damaged_copies(store.path)]
         self._asides: list[str] = []  # a line each
@@ -61,6 +61,14 @@ class MapperRestarts:
         if earlier := [copy for copy in self._copies if not re.search(rf"{re.escape(copy)}\b", said)]:
             lines.append(f"earlier files are kept as {_listed(earlier)}: see what they hold, move them away")
         return lines
+
+    def loading(self) -> dict[str, str]:
+        """Return `loading` of edge.json while the mapper restores the map, else nothing."""
+        return (
+            {"loading": f"loading the map: {self._restored_keyframes} keyframes"}
+            if self._is_restoring
+            else {}
+        )
 
     def record_restored(self) -> None:
         """Record that the mapper has restored the map."""
@@ -89,7 +97,8 @@ class MapperRestarts:
         except Exception as error:  # no content of a file may end the edge
             self._set_aside(f"{type(error).__name__}: {error}")
             return None, []
-        self._is_restoring = bool(restore.rows.tables["keyframe"])
+        self._restored_keyframes = len(restore.rows.tables["keyframe"])
+        self._is_restoring = self._restored_keyframes > 0
         return restore, known
 
     def _set_aside(self, reason: str) -> None:

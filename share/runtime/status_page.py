@@ -220,7 +220,7 @@ function showPlan(plan) {
     .map(id => planOfMap(id, plan.agents)).filter(Boolean);
   const first = figures.length > 4 ? 3 : 4;
   at("plan").replaceChildren(
-    ...(figures.length ? figures.slice(0, first) : [node("span", "no path yet", "none")]));
+    ...(figures.length ? figures.slice(0, first) : [node("span", loading || "no path yet", "none")]));
   foldMore("plans", `${figures.length - first} more maps`, figures.slice(first));
 }
 
@@ -247,7 +247,7 @@ function makeFoldable(names) {
   });
 }
 
-let reported = {};  // agents of the newest report
+let reported = {}, loading;  // agents of the newest report; that a map is read
 const hasLeft = a => a.gone && !a.trouble?.length;  // else it went without a bye, not long ago
 const isLost = a => !hasLeft(a) && ["LOST", "SILENT"].includes(a.state);
 const isStale = a => !hasLeft(a) && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
@@ -308,7 +308,9 @@ function show(now) {
   const warnings = degraded.length ? ["degraded"] : [];
   if (stale) warnings.push(`${agentCount(stale)} without a current pose`);
   if (quarantined) warnings.push(`${agentCount(quarantined)} quarantined`);
-  mark(trouble.length ? "trouble" : warnings.join(", ") || "ok", trouble.length || warnings.length);
+  loading = now.loading;
+  const words = warnings.join(", ") || loading || "ok";
+  mark(trouble.length ? "trouble" : words, trouble.length || warnings.length);
   const lines = trouble.concat(degraded, now.refused ?? []).map(t => node("li", t));
   const first = lines.length > MANY ? MANY - 2 : MANY;
   at("trouble").replaceChildren(...lines.slice(0, first));

@@ -102,7 +102,7 @@ def _health_report(report: dict[str, Any]) -> dict[str, Any]:
         "agent_trouble": agent_trouble,
         "refused": list(report.get("refused") or ()),
         "agents": sorted(name for name, agent in agents if not agent.get("gone")),
-        **{key: report[key] for key in ("uptime_s", "waiting", "last_solve_s") if key in report},
+        **{key: report[key] for key in ("uptime_s", "waiting", "last_solve_s", "loading") if key in report},
     }
 
 

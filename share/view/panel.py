@@ -38,6 +38,7 @@ class SidePanel:
         self._history: dict[str, _AgentHistory] = {}  # by name
         self._names: dict[str, str] = {}  # by run
         self._report = ev.AgentsReported()
+        self.loading = ""  # what the room is waiting for
         self._merges: deque[str] = deque(maxlen=_MAX_MERGE_LINES)
         self._merge_count = 0
 
@@ -83,7 +84,7 @@ class SidePanel:
             lines = "".join(f"<div>{escape(line)}</div>" for line in reversed(self._merges))
             more = "" if self._merge_count <= len(self._merges) else f", the newest of {self._merge_count}"
             parts.append(f'<div style="margin-top:8px"><b>merges</b>{more}{lines}</div>')
-        body = "".join(parts) or "no agent yet"
+        body = escape(self.loading) + "".join(parts) or "no agent yet"
         return f'<div style="{_BODY}">{body}</div>'
 
     def _of(self, name: str) -> _AgentHistory:

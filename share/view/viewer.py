@@ -20,11 +20,12 @@ from share.errors import ShareError, UsageError
 from share.net.http_guard import HttpGuard, http_address, listen
 from share.net.transport import Address
 from share.timing import PeriodicTimer
-from share.view.events import SessionBegun
+from share.view.events import KeyframeArrived, SessionBegun
 from share.view.feed import END, ViewFeed
 from share.view.page_process import HEARTBEAT, LOOK_S, PageProcess, last_words, silence_output
 
 DRAW_HZ = 15.0
+_KEYFRAMES_PER_NOTE = 200  # of a map file, between updates of how much is read
 _PANEL_S = 0.5  # between updates of the panel
 _NICENESS = 15
 _MAX_MESSAGES = 64  # applied before something is drawn
@@ -140,12 +141,23 @@ class Viewer:
         from share.view.sources import map_file_events
 
         assert event.map_file is not None
+        self._show_loading("loading the map", now_s)
         try:
+            count = 0
             for stored in map_file_events(event.map_file):
                 self._apply(stored, now_s)
                 self._show_that_it_runs()
+                count += isinstance(stored, KeyframeArrived)
+                if count % _KEYFRAMES_PER_NOTE == 1:
+                    self._show_loading(f"loading the map: {count} keyframes so far", now_s)
         except ShareError:
             pass  # the edge reports its own problems
+        self._show_loading("", now_s)
+
+    def _show_loading(self, text: str, now_s: float) -> None:
+        """Show it at once, and to browsers that come meanwhile: nothing is drawn until all is read."""
+        self._panel.loading = text
+        self._window.show_panel(self._panel.html(self._room, now_s), ())
 
     def _apply(self, event: Any, now_s: float) -> None:
         self._panel.apply(event)

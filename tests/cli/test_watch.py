@@ -20,6 +20,7 @@ from helpers import terminal_room
 from helpers.terminal_room import PLAN, Terminal
 
 from share.cli.main import cli
+from share.cli.watch import _last_line
 from share.cli.watch import watch as watch_command
 from share.errors import ShareError, UsageError, printable
 from share.net.http_guard import read_token
@@ -109,6 +110,10 @@ def test_an_edge_that_is_gone_is_said_and_its_last_report_stays(
     drawn = click.unstyle(screen.getvalue())
     assert "→ ann" in drawn
     assert "has not answered for 10 s" in drawn
+
+
+def test_an_edge_that_loads_its_map_says_so() -> None:
+    assert "loading the map: 7 keyframes" in _last_line("x", {"loading": "loading the map: 7 keyframes"}, 0.0)
 
 
 def test_a_room_without_agents_says_so() -> None:

@@ -196,6 +196,17 @@ def restarts_of(path):
         return restarts.losses
 
 
+def test_a_map_is_said_to_be_loaded_until_the_mapper_has_it(path):
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.05, print)
+        assert restarts.loading() == {}
+        restore, _ = restarts.load_map()
+        count = len(restore.rows.tables["keyframe"])
+        assert count and restarts.loading() == {"loading": f"loading the map: {count} keyframes"}
+        restarts.record_restored()
+        assert restarts.loading() == {}
+
+
 def test_a_damaged_map_stays_a_loss_until_its_copy_is_moved_away(path):
     assert restarts_of(path) == []
     content = bytearray(path.read_bytes())

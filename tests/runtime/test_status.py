@@ -122,6 +122,15 @@ def test_health_lists_present_agents():
     assert health == expected
 
 
+def test_a_map_that_is_loaded_is_said_and_no_trouble():
+    with serving(lambda: {**REPORT, "loading": "loading the map: 7 keyframes"}) as server:
+        status, _, body = get(server, "/health")
+        page = get(server, "/")[2].decode()
+    health = json.loads(body)
+    assert (status, health["status"], health["loading"]) == (200, "ok", "loading the map: 7 keyframes")
+    assert "now.loading" in page
+
+
 def test_a_peers_bad_messages_do_not_make_the_edge_unhealthy():
     """Whoever restarts an edge because of that would do the attacker's work."""
     edge = EdgeProtocol(Config(), session=5)

@@ -92,6 +92,13 @@ def test_only_who_is_present_can_be_followed() -> None:
     assert panel.agents == {"ann-1": "ann"}
 
 
+def test_a_map_that_is_read_is_said() -> None:
+    panel = SidePanel()
+    panel.loading = "loading the map"
+    html = panel.html(DrawnRoom(), 0.0)
+    assert "loading the map" in html and "no agent yet" not in html
+
+
 def test_long_times_are_in_seconds() -> None:
     late = AGENT | {"pose_ms": 19_233.7, "delay_ms": 136_871.0}
     text = words(panel_of(ev.AgentsReported({"ann": late})))
