@@ -20,12 +20,13 @@ if TYPE_CHECKING:
 
 def export_map_tables(source: str, out: Path, as_json: bool) -> None:
     """Write the trajectories, points and loops of a map. Raises UsageError, ShareError."""
+    from share.recordings.session import SESSION_FILE
     from share.store.export import export_map
     from share.store.map_store import is_map
 
     path = Path(source)
     if not is_map(path):
-        if not (path.exists() or path.parent.is_dir()):
+        if not (path.exists() or (path.parent / SESSION_FILE).exists()):
             raise UsageError(f"{source}: no such file")
         raise UsageError(
             f"{source}: is not a map, and --format tum is for maps; give mcap, rrd, colmap or kitti"
