@@ -25,12 +25,12 @@ def export_map_tables(source: str, out: Path, as_json: bool) -> None:
     from share.store.map_store import is_map
 
     path = Path(source)
-    if not is_map(path):
-        if not (path.exists() or (path.parent / SESSION_FILE).exists()):
-            raise UsageError(f"{source}: no such file")
-        raise UsageError(
-            f"{source}: is not a map, and --format tum is for maps; give mcap, rrd, colmap or kitti"
-        )
+    is_recording = not path.is_file() or path.suffix in (".mcap", ".bag", ".db3")
+    if not (path.exists() or (path.parent / SESSION_FILE).exists()):
+        raise UsageError(f"{source}: no such file")
+    if is_recording and not is_map(path):
+        kinds = "mcap, rrd, colmap or kitti"
+        raise UsageError(f"{source}: is not a map, and --format tum is for maps; give {kinds}")
     map_state = _read_map(path)
     with progress(len(map_state.keyframes), "exporting") as bar:
         exported = export_map(map_state, out, bar)

@@ -51,7 +51,6 @@ def test_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, t
     assert "policy covins-g, loopback, seed 0; in real time, evaluations report the true error" in scored.out
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {
         f"{plain_session.name}-over-time.png",
-        f"{plain_session.name}-merges.png",
         f"{plain_session.name}-where.png",
     }
     rows = rows_of(tmp_path / "one.csv")
