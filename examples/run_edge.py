@@ -20,7 +20,7 @@ def main() -> None:
             pose = agent.pose  # its last
             where = "lost" if pose is None else f"{pose.position.round(2)} m in odom, map {pose.map_id}"
             print(f"{path}: {where}", flush=True)
-        print(f"keyframes in maps: {edge.report().get('maps', {})}")
+        print(f"keyframes in maps: {dict(edge.report().get('maps', {}))}")
 
 
 if __name__ == "__main__":  # the edge's mapper is a process that imports this file

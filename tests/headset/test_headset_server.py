@@ -261,6 +261,7 @@ def test_a_robot_comes_and_stops_and_all_are_told(fresh: HeadsetPage, edge: Room
         assert ann.wait("command", lambda m: m["command"] == 201)["text"] == "stopped"
 
 
+@pytest.mark.slow
 def test_a_page_that_is_silent_is_let_go_and_its_robot_stops(fresh: HeadsetPage, edge: RoomServer) -> None:
     with Bridge(edge.address) as tb, paired(fresh, "ann", keeps_alive=False) as ann:
         began = time.monotonic()
@@ -305,6 +306,7 @@ def test_a_page_that_floods_ends_alone(fresh: HeadsetPage) -> None:
         assert bob.wait("pong", lambda m: m["n"] == 1)
 
 
+@pytest.mark.slow
 def test_a_hundred_connections_keep_no_wearer_out(fresh: HeadsetPage) -> None:
     host, port = fresh.endpoint.split(":")
     with paired(fresh, "ann") as ann:
@@ -422,6 +424,7 @@ def test_an_edge_that_goes_and_comes_is_told_and_all_heals(site: Path) -> None:
             assert one.object.kind is ObjectKind.CUBE
 
 
+@pytest.mark.slow
 def test_a_page_that_does_not_read_holds_up_nobody(fresh: HeadsetPage) -> None:
     feed = fresh.feed
     for k in range(200):

@@ -13,7 +13,7 @@ from helpers.headset_room import HeadsetRoom
 
 from share.geometry import se3
 
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.slow
 
 
 def test_two_wearers_share_a_marker(chromium: Browser, room: HeadsetRoom) -> None:
