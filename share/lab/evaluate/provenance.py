@@ -7,14 +7,15 @@ import os
 import platform
 import sys
 from functools import cache
-from importlib.metadata import version
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import share
 from share.devices.host import core_count
 
-_LIBRARIES = ("numpy", "opencv-python-headless", "pyzmq", "scipy")
+# Modules by package; a frozen program has no metadata of packages.
+_LIBRARIES = {"numpy": "numpy", "opencv-python-headless": "cv2", "pyzmq": "zmq", "scipy": "scipy"}
 _DIGEST_DIGITS = 10
 
 
@@ -25,7 +26,7 @@ def describe_machine() -> dict[str, Any]:
         "cores": core_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        **{name: version(name) for name in _LIBRARIES},
+        **{name: import_module(module).__version__ for name, module in _LIBRARIES.items()},
         "load": round(os.getloadavg()[0], 2),
     }
 
