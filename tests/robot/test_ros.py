@@ -163,6 +163,7 @@ def test_cancel(room: Callable[..., RosRoom]) -> None:
     here.run_._handle(ev.CancelRequested("bob"))
     assert here.run(5.0, here.ended)
     assert here.reports[-1].text == "stopped: cancelled by bob"
+    assert here.run(1.0, lambda: here.robot.of("ended"))  # it comes by another way
     assert here.robot.of("ended") == [{"ended": "canceled"}]
 
 
