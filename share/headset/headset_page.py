@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -31,7 +29,7 @@ from share.headset.wearers import EdgeAccess
 from share.net.http_guard import listen, served_address
 from share.net.transport import Address, parse_address
 from share.view.feed import ViewFeed
-from share.view.page_process import PageProcess, last_words, silence_output
+from share.view.page_process import PageProcess, ServedPage, begin_process, end_process
 
 COLLECT_S = 1 / 60  # between messages to the process: poses are relayed at 30 Hz
 _NICENESS = 5  # below the edge, above the live room
@@ -67,7 +65,7 @@ def page_certificate(
     return own_certificate(default_folder(), host)
 
 
-class HeadsetPage:
+class HeadsetPage(ServedPage):
     """A process that serves the page, and the feed to it. One that ends by itself is started again. `close`
     may be repeated.
 
@@ -96,14 +94,14 @@ class HeadsetPage:
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
         table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
-        self._listener, bound = listen(where)
+        listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
         shown = str(Address(_shown_host(bound.host), bound.port)).removeprefix("tcp://")
         self.url = f"{self.scheme}://{shown}/"
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
-        self.feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
+        feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
         settings = HeadsetSettings(
             access,
             where.host,
@@ -114,30 +112,14 @@ class HeadsetPage:
             table,
             folder,
         )
-        arguments = (self._listener, settings)
-        self._process = PageProcess(_TITLE, _run, arguments, notify, self.feed.reconnect, self._hear)
-
-    @property
-    def pid(self) -> int | None:
-        return self._process.pid
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether there is a process that serves the page, or will in a moment."""
-        return self._process.is_alive
+        process = PageProcess(_TITLE, _run, (listener, settings), notify, feed.reconnect, self._hear)
+        super().__init__(listener, feed, process)
 
     def report(self) -> dict[str, Any]:
         """Return the field `headset` of the edge's report: its address, the code, and its wearers. Safe from
         any thread."""
         fingerprint = None if self.certificate is None else self.certificate.fingerprint
         return {"address": self.url, "fingerprint": fingerprint, **self._report}
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.announce_end()
-        self.feed.close()
-        self._process.close()
-        self._listener.close()
 
     def _hear(self, data: bytes) -> None:
         """Take what the process says."""
@@ -173,20 +155,7 @@ def local_address(endpoint: str) -> str:
 
 def _run(pipe: Connection, listener: socket.socket, settings: Any) -> None:
     """Entry point of the process."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
-    os.nice(_NICENESS)
-    silence_output()
+    begin_process(_NICENESS, listener)
     from share.headset.server import HeadsetServer
 
-    listener.setblocking(False)
-    code = 1
-    try:
-        HeadsetServer(pipe, listener, settings).run()
-        code = 0
-    except (EOFError, BrokenPipeError):  # the parent has ended
-        code = 0
-    except Exception as error:
-        with contextlib.suppress(OSError):
-            pipe.send_bytes(last_words(error))
-    finally:
-        os._exit(code)  # threads of wearers would keep the process
+    end_process(pipe, lambda: HeadsetServer(pipe, listener, settings).run(), (EOFError, BrokenPipeError))

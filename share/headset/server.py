@@ -8,18 +8,15 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
-import logging
 import pickle
 import socket
 import threading
 import time
 from dataclasses import dataclass, field
-from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Response
@@ -34,13 +31,11 @@ from share.headset.pairing import PairingError
 from share.headset.shared_room import SharedRoom
 from share.headset.wearers import EdgeAccess, PageSeat, Wearer, WearerRegistry
 from share.net.bounded_websocket import (
-    BACKLOG,
     HANDSHAKE_S,
-    PING_S,
-    BoundedConnection,
     ModestSelector,
     PeerConnections,
     PeerLimits,
+    serve_bounded,
 )
 from share.view.events import SessionBegun
 from share.view.feed import END, batched
@@ -96,22 +91,16 @@ class HeadsetServer:
 
     async def _serve(self) -> None:
         loop = asyncio.get_running_loop()
-        server = await serve(
+        server = await serve_bounded(
             self._serve_page,
+            self._connections,
             sock=self._listener,
             ssl=self._tls,
             **({} if self._tls is None else {"ssl_handshake_timeout": HANDSHAKE_S}),
-            backlog=BACKLOG,
-            compression=None,
             max_size=page.MAX_PAGE_BYTES,
             write_limit=_UNSENT_BYTES,
-            open_timeout=HANDSHAKE_S,
             close_timeout=_CLOSE_S,
-            ping_interval=PING_S,
-            ping_timeout=PING_S,
             process_request=self._answer,
-            create_connection=partial(BoundedConnection, connections=self._connections),
-            logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)
         threading.Thread(target=self._read_pipe, args=(loop,), name="feed", daemon=True).start()
@@ -342,10 +331,3 @@ async def _refuse(connection: Any, reason: str) -> None:
             await connection.send(page.encode_page({"type": "refused", "reason": reason}))
             await connection.close(1008)
     connection.transport.abort()
-
-
-def _silent_logger() -> logging.Logger:
-    """Return a logger for failed handshakes that prints nothing: anybody can cause them."""
-    logger = logging.Logger("share.headset")
-    logger.addHandler(logging.NullHandler())
-    return logger

@@ -8,15 +8,17 @@ be kept for programs of the server's own machine.
 
 from __future__ import annotations
 
+import logging
 import selectors
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from ipaddress import ip_address
 from typing import Any
 
-from websockets.asyncio.server import ServerConnection
+from websockets.asyncio.server import ServerConnection, serve
 
 from share.timing import TokenBucket
 
@@ -178,3 +180,23 @@ class ModestSelector(selectors.DefaultSelector):
         time.sleep(min(_MAX_SLEEP_S, max(0.0, self._ratio * worked_s)))
         self._cpu_s = time.thread_time()
         return super().select(timeout)
+
+
+def serve_bounded(handler: Any, connections: PeerConnections, **options: Any) -> serve:
+    """Return a server whose connections are bounded by `connections`, not compressed, and pinged.
+
+    options: the others of `websockets.asyncio.server.serve`.
+    """
+    logger = logging.Logger("share.websocket")
+    logger.addHandler(logging.NullHandler())  # anybody can cause failed handshakes
+    return serve(
+        handler,
+        backlog=BACKLOG,
+        compression=None,
+        open_timeout=HANDSHAKE_S,
+        ping_interval=PING_S,
+        ping_timeout=PING_S,
+        create_connection=partial(BoundedConnection, connections=connections),
+        logger=logger,
+        **options,
+    )

@@ -9,13 +9,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import logging
 import re
 import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -267,25 +265,17 @@ class PoseWebSocket:
             self._listener.close()
 
     async def _serve(self) -> None:
-        from websockets.asyncio.server import serve
+        from share.net.bounded_websocket import serve_bounded
 
-        from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, PING_S, BoundedConnection
-
-        server = await serve(
+        server = await serve_bounded(
             self._serve_reader,
+            self.peer_connections,
             sock=self._listener,
-            backlog=BACKLOG,
             origins=self._allowed,
-            compression=None,
             max_size=_MAX_RECEIVED_BYTES,
             write_limit=_UNSENT_BYTES,
-            open_timeout=HANDSHAKE_S,
             close_timeout=_CLOSE_S,
-            ping_interval=PING_S,
-            ping_timeout=PING_S,
             process_request=self._refuse_excess,
-            create_connection=partial(BoundedConnection, connections=self.peer_connections),
-            logger=_silent_logger(),
         )
         self._listener.listen(_BACKLOG)
         while not self._is_closed:
@@ -342,10 +332,3 @@ class PoseWebSocket:
                 f"poses at ws://{self.host}: no new reader for now: {context['exception'].strerror}; "
                 "raise `ulimit -n`, or close what is open"
             )
-
-
-def _silent_logger() -> logging.Logger:
-    """Return a logger for failed handshakes that prints nothing: anybody can cause them."""
-    logger = logging.Logger("share.poses")
-    logger.addHandler(logging.NullHandler())
-    return logger

@@ -6,7 +6,10 @@ ends by itself, and ends it if its heartbeat stops or it grows too large.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import socket
 import sys
 import threading
 import time
@@ -17,6 +20,7 @@ from typing import Any
 from share.net import tcp
 from share.spawning import SPAWN_CONTEXT
 from share.timing import Backoff
+from share.view.feed import ViewFeed
 
 HEARTBEAT = b""
 REPORT = b"{"  # begins a message of the process, a JSON object; else it is its last words
@@ -143,6 +147,56 @@ class PageProcess:
         return data[: 4 * MAX_LAST_WORDS].decode(errors="replace")
 
 
+class ServedPage:
+    """A page that a process of its own serves: its listening socket, the feed to the process, and that.
+    `close` may be repeated."""
+
+    def __init__(self, listener: socket.socket, feed: ViewFeed, process: PageProcess) -> None:
+        self._listener, self.feed, self._process = listener, feed, process
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether there is a process that serves the page, or will in a moment."""
+        return self._process.is_alive
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.announce_end()
+        self.feed.close()
+        self._process.close()
+        self._listener.close()
+
+
+def begin_process(niceness: int, listener: socket.socket) -> None:
+    """Set up a page's process, to be called first in it."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
+    os.nice(niceness)
+    _silence_output()
+    listener.setblocking(False)
+
+
+def end_process(
+    connection: Connection, run: Callable[[], None], parent_ended: tuple[type[Exception], ...]
+) -> None:
+    """Run a page's process to its end, and exit; say what ends it. parent_ended: what `run` raises where its
+    parent has ended."""
+    code = 1
+    try:
+        run()
+        code = 0
+    except parent_ended:
+        code = 0
+    except Exception as error:
+        with contextlib.suppress(OSError):
+            connection.send_bytes(_last_words(error))
+    finally:
+        os._exit(code)  # threads of libraries would keep the process
+
+
 def _fault(pid: int | None, silent_looks: int, max_silent: int) -> str:
     """Return why a process has to be ended, "" if it need not be."""
     if _memory_bytes(pid) > MAX_BYTES:
@@ -158,13 +212,13 @@ def _memory_bytes(pid: int | None) -> int:
         return 0
 
 
-def last_words(error: Exception) -> bytes:
+def _last_words(error: Exception) -> bytes:
     """Return what a process says, as its last message, of what ends it."""
     text = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_LAST_WORDS]
     return text.removeprefix(REPORT.decode()).encode()
 
 
-def silence_output() -> None:
+def _silence_output() -> None:
     """Discard what libraries print: a page's process says nothing on its parent's terminal."""
     null = os.open(os.devnull, os.O_WRONLY)
     sys.stdout.flush()

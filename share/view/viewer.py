@@ -4,10 +4,7 @@ some browser looks. It has the lowest priority.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import pickle
-import signal
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +19,7 @@ from share.net.transport import Address
 from share.timing import PeriodicTimer
 from share.view.events import KeyframeArrived, SessionBegun
 from share.view.feed import END, ViewFeed
-from share.view.page_process import HEARTBEAT, LOOK_S, PageProcess, last_words, silence_output
+from share.view.page_process import HEARTBEAT, LOOK_S, PageProcess, ServedPage, begin_process, end_process
 
 DRAW_HZ = 15.0
 _KEYFRAMES_PER_NOTE = 200  # of a map file, between updates of how much is read
@@ -36,7 +33,7 @@ def is_installed() -> bool:
     return find_spec("viser") is not None
 
 
-class LiveRoom:
+class LiveRoom(ServedPage):
     """A viewer's process, and the feed to it. One that ends by itself is started again. `close` may be
     repeated.
 
@@ -51,51 +48,23 @@ class LiveRoom:
     ) -> None:
         if not is_installed():
             raise UsageError(f"--view: {MISSING}")
-        self._listener, bound = listen(http_address("--view", address, token))
+        listener, bound = listen(http_address("--view", address, token))
         self.endpoint = str(bound).removeprefix("tcp://")
-        self.feed = ViewFeed()
-        arguments = (self._listener, bound, token, title)
-        self._process = PageProcess("live room", _run, arguments, notify, self.feed.reconnect)
-
-    @property
-    def pid(self) -> int | None:
-        return self._process.pid
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether there is a process that serves the page, or will in a moment."""
-        return self._process.is_alive
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.announce_end()
-        self.feed.close()
-        self._process.close()
-        self._listener.close()
+        feed = ViewFeed()
+        arguments = (listener, bound, token, title)
+        process = PageProcess("live room", _run, arguments, notify, feed.reconnect)
+        super().__init__(listener, feed, process)
 
 
 def _run(
     connection: Connection, listener: socket.socket, bound: Address, token: str | None, title: str
 ) -> None:
     """Entry point of the process."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all; the parent ends this process
-    os.nice(_NICENESS)
-    silence_output()
+    begin_process(_NICENESS, listener)
     from share.view.window import Window
 
-    listener.setblocking(False)
-    window = Window(listener, HttpGuard(bound, token), title)
-    code = 1
-    try:
-        Viewer(connection, window).run()
-        code = 0
-    except (EOFError, OSError):  # the parent has ended
-        code = 0
-    except Exception as error:
-        with contextlib.suppress(OSError):
-            connection.send_bytes(last_words(error))
-    finally:
-        os._exit(code)  # threads of viser would keep the process
+    viewer = Viewer(connection, Window(listener, HttpGuard(bound, token), title))
+    end_process(connection, viewer.run, (EOFError, OSError))
 
 
 class Viewer:
