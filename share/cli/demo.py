@@ -119,24 +119,26 @@ def _check_policy(policy: str, is_compared: bool, true_error: bool) -> None:
 def _play(session: Session, seconds: float, terms: RunOptions, view: bool, out: Path, as_json: bool) -> None:
     """Play a session in real time; show how accurately the agents knew their poses."""
     from share.lab.evaluate.provenance import describe_machine
-    from share.lab.evaluate.real_time import play_in_real_time
+    from share.lab.evaluate.real_time import played_in_real_time
     from share.lab.evaluate.scoring import join_times, score_session
 
     machine = describe_machine()
     screen = RunScreen(view)
-    folders = play_in_real_time(session, seconds, terms, out, screen.show, screen.pages)
-    screen.end()
-    result = score_session(session, folders)
-    since_s = join_times(out / "edge" / "events.jsonl")
-    picture = _draw_paths(out, result)
-    if as_json:
-        click.echo(json.dumps(_document(terms.policy, result, since_s)))
-        return
-    click.echo(_score_table(result, since_s, terms.policy == STREAMED))
-    for line in _advice(result, seconds, machine["load"], machine["cores"]):
-        click.echo(line)
-    if picture is not None:
-        click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
+    with played_in_real_time(session, seconds, terms, out, screen.show, screen.pages) as folders:
+        screen.end()
+        result = score_session(session, folders)
+        since_s = join_times(out / "edge" / "events.jsonl")
+        picture = _draw_paths(out, result)
+        if as_json:
+            click.echo(json.dumps(_document(terms.policy, result, since_s)))
+            return
+        click.echo(_score_table(result, since_s, terms.policy == STREAMED))
+        for line in _advice(result, seconds, machine["load"], machine["cores"]):
+            click.echo(line)
+        if picture is not None:
+            click.echo(f"\npicture: {picture}   decisions of the edge: {out / 'edge' / 'events.jsonl'}")
+        if view:
+            click.pause("\nThe pages above stay until you press a key.")  # returns at once without a terminal
 
 
 def _advice(result: SessionScore, seconds: float, load: float, cores: int) -> list[str]:

@@ -21,6 +21,7 @@ _BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
 _NAME = f"{_DIM};padding-right:8px;vertical-align:top"
 _BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
 _SPARKLINE = "width:100%;max-width:320px;display:block;overflow:visible"
+_SMALL_SPARKLINE = "width:84px;height:1em;vertical-align:-0.1em;margin-left:6px;overflow:visible"  # in a line
 _MAX_MERGE_LINES = 4  # newest merges
 _MAX_FULL = 4  # agents of which all is shown; of more, a line each
 
@@ -77,7 +78,7 @@ class SidePanel:
             run = room.runs.get(agent["run"])
             swatch = "rgb({}, {}, {})".format(*((128, 128, 128) if run is None else room.colour(run)))
             if present_count > _MAX_FULL or has_left(agent):
-                parts.append(_line(label, agent, swatch))
+                parts.append(_line(label, agent, swatch, tuple(self._of(label).ages_ms)))
             else:
                 parts.append(self._agent(label, agent, swatch, room.corrections.get(agent["run"]), now_s))
         if self._merges:
@@ -149,13 +150,14 @@ def _faults(agent: Any) -> str:
     return "".join(f'<div style="color:{_BAD}">{escape(line)}</div>' for line in agent["trouble"] or ())
 
 
-def _line(label: str, agent: Any, swatch: str) -> str:
+def _line(label: str, agent: Any, swatch: str, ages_ms: tuple[float, ...]) -> str:
     """Return an agent on one line, and what is wrong with it below."""
     if has_left(agent):
         return f'<div style="opacity:.5">{_head(label, agent, swatch)}</div>'
     figures = [] if agent["pose_ms"] is None else [_duration(agent["pose_ms"], 0)]
     figures += [] if agent["qoe"] is None else [f"QoE {agent['qoe']:.2f}"]
     more = f' <span style="{_DIM}">{" · ".join(figures)}</span>'
+    more += sparkline(ages_ms, LIMITS[AgentKind(agent["kind"])].pose_ms, swatch, is_small=True)
     return f"<div>{_head(label, agent, swatch, more)}{_faults(agent)}</div>"
 
 
@@ -163,8 +165,9 @@ def _duration(ms: float, digits: int) -> str:
     return f"{ms:.{digits}f} ms" if ms < 1000 else f"{ms / 1000:.1f} s"
 
 
-def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:
-    """Return an SVG of values over time, with a dashed line at `limit`; "" without values."""
+def sparkline(values: tuple[float, ...], limit: float, colour: str, is_small: bool = False) -> str:
+    """Return an SVG of values over time, with a dashed line at `limit`; "" without values. is_small: for a
+    line of text, so without words."""
     if not values:
         return ""
     top = limit * min(_MOST_LIMITS, max(2.0, *(value / limit for value in values)))
@@ -173,9 +176,16 @@ def sparkline(values: tuple[float, ...], limit: float, colour: str) -> str:
     points = " ".join(f"{step * k:.1f},{height:.1f}" for k, height in enumerate(y))
     limit_y = _HEIGHT * (1 - limit / top)
     line = f'<line x1="0" x2="{_WIDTH:.0f}" y1="{limit_y:.1f}" y2="{limit_y:.1f}"'
-    return (
-        f'<svg viewBox="0 0 {_WIDTH + 34:.0f} {_HEIGHT:.0f}" style="{_SPARKLINE}">'
-        f'{line} stroke="{_BAD}" stroke-dasharray="4 3"/>'
-        f'<text x="{_WIDTH + 3:.0f}" y="{limit_y + 3:.1f}" font-size="9" fill="{_BAD}">{limit:.0f} ms</text>'
-        f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.3"/></svg>'
+    plain = 'fill="none" vector-effect="non-scaling-stroke"'
+    lines = (
+        f'{line} stroke="{_BAD}" stroke-dasharray="4 3" {plain}/>'
+        f'<polyline points="{points}" stroke="{colour}" stroke-width="1.3" {plain}/>'
     )
+    if is_small:
+        box = f'viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" preserveAspectRatio="none"'
+        return f'<svg {box} style="{_SMALL_SPARKLINE}">{lines}</svg>'
+    text = (
+        f'<text x="{_WIDTH + 3:.0f}" y="{limit_y + 3:.1f}" font-size="9" fill="{_BAD}">{limit:.0f} ms</text>'
+    )
+    box = f'viewBox="0 0 {_WIDTH + 34:.0f} {_HEIGHT:.0f}"'
+    return f'<svg {box} style="{_SPARKLINE}">{lines}{text}</svg>'

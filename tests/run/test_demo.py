@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import re
 import subprocess
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +93,38 @@ def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
         report = json.loads((tmp_path / "out" / name / "report.json").read_text())
         assert report["frames"] == report["tracked"] == 45
     assert len(list((plain_cache / "share").iterdir())) == 1  # the session that was there, by the same recipe
+
+
+@pytest.mark.long
+def test_in_a_terminal_the_pages_stay_after_the_run(plain_cache, tmp_path):
+    """Until a key is pressed: somebody looks at them."""
+    terminal, theirs = pty.openpty()
+    seed = ("--scene", "plain", "--seed", "18", "--seconds", "3")
+    process = subprocess.Popen(
+        [*SHARE, "demo", "--out", str(tmp_path / "out"), *seed],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        env={**os.environ, "XDG_CACHE_HOME": str(plain_cache), "TERM": "dumb"},
+        start_new_session=True,
+    )
+    os.close(theirs)
+    try:
+        said = ""
+        while "until you press a key" not in said:
+            said += os.read(terminal, 4096).decode(errors="replace")  # OSError where it has ended
+        assert "agents in one map" in said
+        pages = re.findall(r"http://127\.0\.0\.1:\d+/", said)
+        assert pages
+        for page in pages:
+            with urllib.request.urlopen(page, timeout=10) as reply:
+                assert reply.status == 200
+        os.write(terminal, b" ")
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        process.wait()
+        os.close(terminal)
 
 
 @pytest.mark.slow

@@ -86,6 +86,21 @@ def test_poses_are_a_line_below_or_above_the_limit() -> None:
     assert sparkline((), 20.0, "red") == ""
 
 
+def test_of_many_agents_each_has_its_line_of_poses() -> None:
+    names = [f"a{k}" for k in range(7)]
+    arrivals = [
+        event
+        for name in names
+        for event in (
+            ev.RunArrived(f"{name}-1", name, AgentKind.AR, np.eye(4), (0.8, 0.6)),
+            ev.PoseArrived(f"{name}-1", TrackState.OK, 0, np.eye(4), 5.0),
+        )
+    ]
+    reported = ev.AgentsReported({name: AGENT | {"run": f"{name}-1"} for name in names})
+    html = panel_of(reported, *arrivals)
+    assert html.count("<polyline") == 7 and "limit 20 ms" not in html
+
+
 def test_only_who_is_present_can_be_followed() -> None:
     panel = SidePanel()
     panel.apply(ev.AgentsReported({"ann": AGENT, "bob": AGENT | {"run": "bob-1", "gone": True}}))

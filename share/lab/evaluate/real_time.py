@@ -133,10 +133,25 @@ def play_in_real_time(
     out: Path,
     show: Callable[[Progress], None],
     pages: Pages | None = None,
-) -> dict[str, Path]:
-    """Run `session` in real time and return the folder of each agent's files, by name.
+) -> None:
+    """Run `session` in real time; see `played_in_real_time`."""
+    with played_in_real_time(session, seconds, options, out, show, pages):
+        pass
 
-    pages: what to serve meanwhile; None: nothing.
+
+@contextmanager
+def played_in_real_time(
+    session: Session,
+    seconds: float,
+    options: RunOptions,
+    out: Path,
+    show: Callable[[Progress], None],
+    pages: Pages | None = None,
+) -> Iterator[dict[str, Path]]:
+    """Run `session` in real time until its agents have ended; the edge serves its pages until the block is
+    left. Yields the folder of each agent's files, by name.
+
+    pages: what to serve; None: nothing.
 
     Raises ShareError with the process that failed and the last line of its log, UsageError for a link of an
     unknown agent.
@@ -164,10 +179,16 @@ def play_in_real_time(
             child = running_child(logs[name], "agent", *identity, *destination, *terms)
             agents[name] = stack.enter_context(child)
         _watch(agents, _RunMonitor(folders, out / "edge" / "events.jsonl"), seconds + AGENT_GRACE_S, show)
-        for name, process in {**agents, "edge": edge}.items():
-            if code := stop_child(process):
-                raise ShareError(f"{name} failed: {_why_it_failed(code, logs[name])}")
-    return folders
+        _stop_children(agents, logs)
+        yield folders
+        _stop_children({"edge": edge}, logs)
+
+
+def _stop_children(processes: Processes, logs: dict[str, Path]) -> None:
+    """Stop processes. Raises ShareError if one of them failed."""
+    for name, process in processes.items():
+        if code := stop_child(process):
+            raise ShareError(f"{name} failed: {_why_it_failed(code, logs[name])}")
 
 
 def _wait_for_line(edge: subprocess.Popen[bytes], log: Path, pattern: str) -> str:
