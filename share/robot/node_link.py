@@ -60,7 +60,8 @@ class NodeLink:
     def __init__(self, address: str, keys: NodeKeys | None, print_line: Callable[[str], None]) -> None:
         target = check_keys(parse_address(address, bind=True), keys)
         self._print_line, self._line_limiter = print_line, LineLimiter()
-        self._nodes: dict[bytes, Freshness] = {}  # by the socket's name of each, oldest first
+        self._nodes: dict[bytes, Freshness] = {}  # by the socket's name of each; only the first is heard
+        self._first_since_ns = 0
         self._heard_ns: dict[bytes, int] = {}
         self._sent_ns = 0
         self._fixed: dict[str, Any] = {"name": secrets.token_hex(4)}
@@ -90,12 +91,41 @@ class NodeLink:
         for line in [] if self._guard is None else self._guard.take_reports():
             self._say(f"a program at the node's port: {line}", "guard")
         for name in [one for one, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_NS]:
-            del self._heard_ns[name], self._nodes[name]
-            if not self._nodes:
-                self._print_line("the robot's node is gone")
+            self._forget(name, now_ns)
+        if len(self._nodes) > 1 and self._is_first_mute(now_ns):
+            self._put_last(next(iter(self._nodes)), now_ns)
         if now_ns - self._sent_ns > HEARTBEAT_NS:
             self._send({})
         return events
+
+    def _forget(self, name: bytes, now_ns: int) -> None:
+        is_first = name == next(iter(self._nodes))
+        del self._heard_ns[name], self._nodes[name]
+        if is_first:
+            self._first_since_ns = now_ns
+        if not self._nodes:
+            self._print_line("the robot's node is gone")
+
+    def _is_first_mute(self, now_ns: int) -> bool:
+        """Return whether the first node answers nothing that is sent to it, so is none of ours."""
+        first = next(iter(self._nodes.values()))
+        return now_ns - max(self._first_since_ns, first.heard_ns or 0) > SILENT_NS
+
+    def _put_last(self, name: bytes, now_ns: int) -> None:
+        self._nodes[name] = self._nodes.pop(name)
+        self._first_since_ns = now_ns
+
+    def _add(self, name: bytes, now_ns: int) -> None:
+        self._nodes[name] = Freshness(secrets.randbits(61))
+        if len(self._nodes) == 1:
+            self._first_since_ns = now_ns
+            self._print_line("the robot's node has connected")
+        else:
+            self._say(
+                f"{len(self._nodes)} programs speak as the robot's node at {self.endpoint}, and one is heard; "
+                "end the others, or use keys",
+                "more nodes",
+            )
 
     def _take(self, parts: list[zmq.Frame], now_ns: int) -> list[ev.RobotEvent]:
         if len(parts) != 2:
@@ -108,9 +138,9 @@ class NodeLink:
             if message["version"] != VERSION:
                 self._say("the robot's node is of another release; write it anew with `share robot node`")
                 return []
-            if not self._nodes:
-                self._print_line("the robot's node has connected")
-            fresh = self._nodes.setdefault(name, Freshness(secrets.randbits(61)))
+            if name not in self._nodes:
+                self._add(name, now_ns)
+            fresh = self._nodes[name]
             self._heard_ns[name] = now_ns
             if not fresh.take(message, now_ns) or name != next(iter(self._nodes)):
                 return []

@@ -122,6 +122,9 @@ class FakeNode:
         return events
 
 
+STALE = b'{"version": 1, "at": 1, "seen": null}'
+
+
 @pytest.fixture
 def printed() -> list[str]:
     return []
@@ -212,6 +215,24 @@ def test_of_two_nodes_only_the_first_is_heard_and_the_robot_is_two(link: NodeLin
             assert first.run(0.1, found=found)[-1].odometry_publishers == 2
 
 
+def test_a_program_that_came_first_and_answers_nothing_loses_its_place(
+    link: NodeLink, printed: list[str]
+) -> None:
+    """It holds the connection without ever hearing the bridge; the true node comes after it."""
+    with FakeNode(link) as mute, FakeNode(link) as node:
+        end = time.monotonic() + 10
+        events: list[ev.RobotEvent] = []
+        while not events and time.monotonic() < end:
+            mute.socket.send(STALE)
+            events = node.run(0.1, foreign="map")
+        assert events
+        mute.socket.send(STALE)
+        assert node.run(2.5, foreign="map")[-1:]
+        mute.socket.send(STALE)
+        assert node.run(0.2, foreign="map")  # it keeps the place
+    assert any("2 programs speak as the robot's node at tcp://127.0.0.1:" in line for line in printed)
+
+
 def test_a_node_that_is_silent_is_gone_and_the_next_is_heard(link: NodeLink, printed: list[str]) -> None:
     with FakeNode(link) as node:
         node.run()
@@ -222,9 +243,6 @@ def test_a_node_that_is_silent_is_gone_and_the_next_is_heard(link: NodeLink, pri
     assert printed == ["the robot's node has connected", "the robot's node is gone"]
     with FakeNode(link) as node:
         assert node.run(foreign="map")
-
-
-STALE = b'{"version": 1, "at": 1, "seen": null}'
 
 
 @pytest.mark.parametrize(
