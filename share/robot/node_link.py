@@ -122,8 +122,8 @@ class NodeLink:
             self._print_line("the robot's node has connected")
         else:
             self._say(
-                f"{len(self._nodes)} programs speak as the robot's node at {self.endpoint}, and one is heard; "
-                "end the others, or use keys",
+                f"{len(self._nodes)} programs speak as the robot's node at {self.endpoint}; one is heard, "
+                "so end the others, or use keys",
                 "more nodes",
             )
 
