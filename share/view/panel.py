@@ -21,7 +21,7 @@ _BAD, _GOOD, _DIM = "#e5484d", "#30a46c", "opacity:.65"
 _NAME = f"{_DIM};padding-right:8px;vertical-align:top"
 _BODY = "font:12px/1.4 system-ui,sans-serif;padding:2px 10px;overflow-wrap:anywhere"
 _SPARKLINE = "width:100%;max-width:320px;display:block;overflow:visible"
-_SMALL_SPARKLINE = "width:84px;height:1em;vertical-align:-0.1em;margin-left:6px;overflow:visible"  # in a line
+_SMALL_SPARKLINE = "width:14%;height:1em;float:right;margin-top:3px"
 _MAX_MERGE_LINES = 4  # newest merges
 _MAX_FULL = 4  # agents of which all is shown; of more, a line each
 
@@ -157,8 +157,8 @@ def _line(label: str, agent: Any, swatch: str, ages_ms: tuple[float, ...]) -> st
     figures = [] if agent["pose_ms"] is None else [_duration(agent["pose_ms"], 0)]
     figures += [] if agent["qoe"] is None else [f"QoE {agent['qoe']:.2f}"]
     more = f' <span style="{_DIM}">{" · ".join(figures)}</span>'
-    more += sparkline(ages_ms, LIMITS[AgentKind(agent["kind"])].pose_ms, swatch, is_small=True)
-    return f"<div>{_head(label, agent, swatch, more)}{_faults(agent)}</div>"
+    line = sparkline(ages_ms, LIMITS[AgentKind(agent["kind"])].pose_ms, swatch, is_small=True)
+    return f"<div>{line}{_head(label, agent, swatch, more)}{_faults(agent)}</div>"
 
 
 def _duration(ms: float, digits: int) -> str:
