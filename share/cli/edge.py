@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from share.headset.headset_page import HeadsetPage
     from share.headset.wearers import EdgeAccess
     from share.net.keys import EdgeKeys
+    from share.net.transport import Address
     from share.runtime.edge import EdgeRun
     from share.runtime.edge_observer import EdgeObserver
     from share.store.map_store import MapStore
@@ -113,7 +114,6 @@ def edge(
     from contextlib import ExitStack, closing
 
     from share.cli.stderr import Stderr
-    from share.net.http_guard import read_token
     from share.net.keys import allowed_without_keys, edge_keys_for
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
@@ -126,23 +126,15 @@ def edge(
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
-    if headset is None and (headset_cert or headset_key or mounts):
-        raise UsageError("--headset-cert, --headset-key, --mount: they are for --headset; give it too")
-    if headset is not None and is_streamed:
-        raise UsageError("--headset: policy streamed builds no map; leave it out, or choose another policy")
+    served = _PageOptions(http, view, headset, headset_cert, headset_key, mounts, http_token, out)
+    served.check(bind, is_streamed)
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
-    if http_token is not None and http is None and view is None:
-        raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
-    token = None if http_token is None else read_token(http_token)
-    _check_apart(bind, http, view, token)
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
         # before any process starts: the port may be in use
-        pages = _EdgePages(stack, stderr, http, view, token)
-        if headset is not None:
-            files = _HeadsetFiles(headset_cert, headset_key, mounts, out)
-            pages.add_headset(headset, _edge_access(link.endpoint, edge_key_pair, allowed), files)
+        access = None if headset is None else _edge_access(link.endpoint, edge_key_pair, allowed)
+        pages = _EdgePages(stack, stderr, served, access)
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         on_event = partial(_print_event, stderr, verbose)
         run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed)
@@ -152,18 +144,61 @@ def edge(
             _print_keys(stderr, edge_key_pair)
             if allowed:
                 stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")
-            pages.print_addresses(http_token)
+            pages.print_addresses()
             report = run.run()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-class _HeadsetFiles(NamedTuple):
-    """Files of the headset page; out: folder for what it measures."""
+class _PageOptions(NamedTuple):
+    """What the edge serves to browsers. out: folder for what headset pages measure."""
 
+    http: str | None
+    view: str | None
+    headset: str | None
     certificate: Path | None
-    key: Path | None
+    certificate_key: Path | None
     mounts: tuple[str, ...]
+    token_file: Path | None
     out: Path | None
+
+    def token(self) -> str | None:
+        """Return the token of the status page and the live room. Raises UsageError."""
+        from share.net.http_guard import read_token
+
+        return None if self.token_file is None else read_token(self.token_file)
+
+    def check(self, bind: str, is_streamed: bool) -> None:
+        """Raise UsageError if an option lacks another, one names no address, or two name the same."""
+        if self.headset is None and (self.certificate or self.certificate_key or self.mounts):
+            raise UsageError("--headset-cert, --headset-key, --mount: they are for --headset; give it too")
+        if self.headset is not None and is_streamed:
+            raise UsageError(
+                "--headset: policy streamed builds no map; leave it out, or choose another policy"
+            )
+        if self.token_file is not None and self.http is None and self.view is None:
+            raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
+        named: dict[str, Address] = {}
+        for option, address in self._addresses(bind).items():
+            for other, taken in named.items():
+                if address == taken and address.port:
+                    text = f"{other} and {option} name the same port {address.port}; give each its own"
+                    raise UsageError(text)
+            named[option] = address
+
+    def _addresses(self, bind: str) -> dict[str, Address]:
+        from share.net.http_guard import http_address
+        from share.net.transport import parse_address
+
+        token = self.token()
+        addresses = {"--bind": parse_address(bind, bind=True)}
+        for option, text in (("--http", self.http), ("--view", self.view)):
+            if text is not None:
+                addresses[option] = http_address(option, text, token)
+        if self.headset is not None:
+            from share.headset.headset_page import page_address
+
+            addresses["--headset"], _ = page_address(self.headset)
+        return addresses
 
 
 def _edge_access(endpoint: str, keys: EdgeKeys | None, allowed: frozenset[Permission]) -> EdgeAccess:
@@ -183,30 +218,15 @@ def _edge_access(endpoint: str, keys: EdgeKeys | None, allowed: frozenset[Permis
     return EdgeAccess(address, allowed, keys.allowed.path.parent, keys.own.public, secret)
 
 
-def _check_apart(bind: str, http: str | None, view: str | None, token: str | None) -> None:
-    """Raise UsageError if two options name one address, or one of them none."""
-    from share.net.http_guard import http_address
-    from share.net.transport import parse_address
-
-    named = {"--bind": parse_address(bind, bind=True)}
-    for option, text in (("--http", http), ("--view", view)):
-        if text is None:
-            continue
-        address = http_address(option, text, token)
-        for other, taken in named.items():
-            if address == taken and address.port:
-                raise UsageError(f"{other} and {option} name the same port {address.port}; give each its own")
-        named[option] = address
-
-
 class _EdgePages:
     """The status page, the live room and the headset page of an edge, as far as they are asked for. run: set
     once it is made.
 
-    Raises UsageError for an address that is none, TransportError for a port in use."""
+    access: of the clients of wearers; None: there is no headset page. Raises UsageError for what is malformed
+    or missing, TransportError for a port in use."""
 
     def __init__(
-        self, stack: ExitStack, stderr: Stderr, http: str | None, view: str | None, token: str | None
+        self, stack: ExitStack, stderr: Stderr, served: _PageOptions, access: EdgeAccess | None
     ) -> None:
         from share.runtime.plan import Plan
         from share.runtime.status_server import StatusServer
@@ -215,31 +235,33 @@ class _EdgePages:
         self.run: EdgeRun | None = None
         self.observers: list[EdgeObserver] = []
         self._stderr, self._addresses = stderr, list[str]()
-        self._stack = stack
+        self._stack, self._token_file, token = stack, served.token_file, served.token()
         self._room: LiveRoom | None = None
         self._headset: HeadsetPage | None = None
-        if http is not None:
+        if served.http is not None:
             plan = Plan()
-            status = StatusServer(http, self._report, stderr.print_line, token, plan.report)
+            status = StatusServer(served.http, self._report, stderr.print_line, token, plan.report)
             stack.callback(status.close)
             self.observers.append(plan)
             self._addresses.append(f"status at http://{status.endpoint}/")
-        if view is not None:
-            self._room = LiveRoom(view, token, "SHARE edge", stderr.print_line)
+        if served.view is not None:
+            self._room = LiveRoom(served.view, token, "SHARE edge", stderr.print_line)
             stack.callback(self._room.close)
             self.observers.append(self._room.feed)
             self._addresses.append(f"live room at http://{self._room.endpoint}/")
+        if served.headset is not None and access is not None:
+            self._add_headset(served.headset, access, served)
 
-    def add_headset(self, address: str, access: EdgeAccess, files: _HeadsetFiles) -> None:
+    def _add_headset(self, address: str, access: EdgeAccess, served: _PageOptions) -> None:
         from share.headset.headset_page import HeadsetPage
 
         self._headset = page = HeadsetPage(
             address,
             access,
-            certificate=files.certificate,
-            key=files.key,
-            mounts=files.mounts,
-            out=files.out,
+            certificate=served.certificate,
+            key=served.certificate_key,
+            mounts=served.mounts,
+            out=served.out,
             notify=self._stderr.print_line,
         )
         self._stack.callback(page.close)
@@ -257,7 +279,8 @@ class _EdgePages:
             report = report | {"headset": self._headset.report()}
         return report
 
-    def print_addresses(self, token_file: Path | None) -> None:
+    def print_addresses(self) -> None:
+        token_file = self._token_file
         password = "" if token_file is None else f"  (any name; the password is in {token_file})"
         for one in self._addresses:
             is_guarded = one.startswith(("status", "live room"))

@@ -721,6 +721,8 @@ def test_pages_of_an_edge_do_not_share_a_port(share, tmp_path):
     """It was told to stop the other edge, and there was none."""
     done = share("edge", "--http", "8093", "--view", "8093", "--out", tmp_path / "out")
     assert complaint(done, 2) == "share: --http and --view name the same port 8093; give each its own\n"
+    done = share("edge", "--http", "8093", "--headset", "http://127.0.0.1:8093")
+    assert complaint(done, 2) == "share: --http and --headset name the same port 8093; give each its own\n"
 
 
 def test_edge_with_a_full_disk_continues(room, share, tmp_path):
