@@ -14,7 +14,7 @@ from share.colours import (
     series_colours,
 )
 from share.config import POLICY_NAMES
-from share.runtime.status_page import PAGE
+from share.runtime.status_page import status_page
 
 
 def test_every_policy_has_a_colour_of_its_own() -> None:
@@ -40,5 +40,6 @@ def test_agents_are_coloured_in_order_and_the_page_does_the_same() -> None:
     colours = agent_colours(["ann", "bob"])
     assert colours == {"ann": hex_colour(agent_colour(0)), "bob": hex_colour(agent_colour(1))}
     assert agent_colour(len(AGENT_COLOURS)) == agent_colour(0)
-    assert all(hex_colour(colour) in PAGE for colour in AGENT_COLOURS)
-    assert "%COLOURS%" not in PAGE
+    page = status_page().decode()
+    assert all(hex_colour(colour) in page for colour in AGENT_COLOURS)
+    assert "%COLOURS%" not in page

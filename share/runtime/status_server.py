@@ -10,7 +10,7 @@ from http import HTTPStatus
 from typing import Any
 
 from share.runtime.edge_metrics import render_metrics
-from share.runtime.status_page import PAGE
+from share.runtime.status_page import status_page
 from share.runtime.web import Response, WebServer, text_response
 
 CACHE_S = 0.1  # lifetime of a response: any number of clients costs the edge ten reports a second
@@ -120,7 +120,7 @@ def _json(status: HTTPStatus, value: Any) -> Response:
     return Response(status, "application/json", json.dumps(value, allow_nan=False).encode() + b"\n")
 
 
-_PAGE = Response(HTTPStatus.OK, "text/html; charset=utf-8", PAGE.encode())
+_PAGE = Response(HTTPStatus.OK, "text/html; charset=utf-8", status_page())
 _REPORTS = {
     "/health": _health,
     "/health/agents": _agents_health,

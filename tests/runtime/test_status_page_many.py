@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from share.runtime.status_page import PAGE
+from share.runtime.status_page import status_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = [
@@ -56,7 +56,7 @@ def documents(count: int) -> dict[str, str]:
     }
     plan = {"agents": {f"agent{k}": place(k) for k in order}}
     return {
-        "/": PAGE,
+        "/": status_page().decode(),
         "/frame": FRAME,
         "/snapshot.json": json.dumps(snapshot),
         "/plan.json": json.dumps(plan),
