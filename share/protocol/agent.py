@@ -24,6 +24,7 @@ from share.protocol.keyframe_pace import KeyframePace
 from share.protocol.localisation import MapLocalisation, SelfEvaluation, pose_update
 from share.timing import PeriodicTimer, seconds_to_ns
 from share.types import F64, Correction, OdometryKeyframe
+from share.vision.keyframe_images import with_less_quality
 from share.wire import messages as m
 from share.wire.codec import encode, message_bytes
 from share.wire.layouts import Bytes
@@ -174,6 +175,8 @@ class AgentProtocol:
         unacknowledged = len(self._ledger.pending) if self.is_connected else 0
         sent = self._pace.take(candidate, unacknowledged, self._now_ns)
         if sent:
+            if (quality := self._pace.jpeg_quality) is not None:
+                candidate = replace(candidate, image=with_less_quality(candidate.image, quality))
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
             self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
             self._self_evaluation.add_keyframe(keyframe, frame, self._pace.next_send_ns(self._now_ns))

@@ -206,5 +206,6 @@ class RoomMembership:
     def send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
         if grant is not None and grant != peer.grant:
-            self._out.send(peer.id, wire.Rate(grant.hz, self._rate_scheduler.is_windowed, grant.pose_hz))
+            is_windowed = self._rate_scheduler.is_windowed
+            self._out.send(peer.id, wire.Rate(grant.hz, is_windowed, grant.pose_hz, grant.jpeg_quality))
             peer.grant = grant

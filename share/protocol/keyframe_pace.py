@@ -25,6 +25,7 @@ class KeyframePace:
         self._window: KeyframeWindow | None = None  # None: the edge asks for none
         self._poses = TokenBucket(1.0)
         self._held_until_ns = 0
+        self.jpeg_quality: int | None = None  # of keyframes' pictures; None: as they are
 
     @property
     def hz(self) -> float | None:
@@ -40,7 +41,7 @@ class KeyframePace:
         """Forget what an earlier session of the edge asked for."""
         self._bucket.set_rate(None, now_ns)
         self._poses.set_rate(None, now_ns)
-        self._window = None
+        self._window = self.jpeg_quality = None
 
     def hold(self, hold_ms: float, now_ns: int) -> None:
         """Hold keyframes, as a welcome asks for."""
@@ -57,6 +58,7 @@ class KeyframePace:
             self._bucket.limit_saved(1.0)
         self._bucket.set_rate(max(rate.hz, _MIN_RATE_HZ), now_ns)
         self._poses.set_rate(rate.pose_hz, now_ns)
+        self.jpeg_quality = rate.jpeg_quality
         if not rate.is_windowed:
             self._window = None
         elif self._window is None:

@@ -146,12 +146,19 @@ class FixedPolicy(Policy):
     has_merge_gate = True
 
     def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
-        return RateGrant(self._hz)
+        return self._grant
+
+    def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
+        return self._grant
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
     ) -> float | None:
         return self._hz
+
+    @property
+    def _grant(self) -> RateGrant:
+        return RateGrant(self._hz, None, self._config.fixed_jpeg_quality)
 
     @property
     def _hz(self) -> float:

@@ -15,6 +15,10 @@ Where keyframes at all wanted rates would wait for each other for more than `FRE
 with its least rate. The rest is allocated in small steps, each to the agent with the largest QoE gain for its
 airtime, while the wait stays below that; beyond it only where a step gains a headset more QoE than the delay
 it adds costs all. What a keyframe takes alone on slow air does not depend on the rates, so it does not count.
+
+Before that, pictures are compressed more: where keyframes with full pictures at all wanted rates would wait
+for more than `FREE_WAIT_MS`, or take more than `SLOW_KEYFRAME_MS` alone, all agents send small ones. Whether
+they do follows from T at full size, T / s with s the size of a keyframe as sent, so it does not swing either.
 """
 
 from __future__ import annotations
@@ -36,6 +40,11 @@ LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay 
 JOINING_HZ = 1.0  # Hz, of an agent that is alone in its map
 SLOW_START_HZ = 2.0  # Hz, of an agent that sends its first keyframes
 FREE_WAIT_MS = 5.0  # a quarter of the delay that a wearer notices
+SLOW_KEYFRAME_MS = 10.0  # on the air: half of what a wearer notices
+SMALL_JPEG_QUALITY = 20  # of small pictures; those that agents make have 50
+SMALL_SIZE = (
+    0.45  # of a keyframe with a small picture, beside one with a full one (docs/lab/scheduling-figures.md)
+)
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 # air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a keyframe's
@@ -58,8 +67,8 @@ class AgentDemand:
     """One agent's demand. wanted_hz: rate by its own QoE. keyframe_s: A, as it reports it. arrival_s: D, from
     the message before a keyframe until the keyframe has arrived, as the edge observes it. delay_ms,
     error_cm: as in `qoe`. drift_cm: part of the error that grows between keyframes. hz: rate of its
-    keyframes, pose_hz: of poses. Times and rates are filtered. is_placed: it shares a map with somebody, or
-    nobody is there."""
+    keyframes, pose_hz: of poses. Times, rates, size are filtered. is_placed: it shares a map with somebody,
+    or nobody is there. size: s, of its keyframes, beside ones with full pictures."""
 
     terms: QoeParameters
     wanted_hz: float
@@ -72,6 +81,7 @@ class AgentDemand:
     pose_hz: float
     updated_ns: int
     is_placed: bool = True
+    size: float = 1.0
 
     @property
     def observed_s(self) -> float:
@@ -96,10 +106,17 @@ class AgentDemand:
 
 @dataclass(frozen=True)
 class RateGrant:
-    """What an agent may send: keyframes and poses a second. pose_hz None: every pose."""
+    """What an agent may send: keyframes and poses a second, and the quality of pictures. pose_hz None: every
+    pose. jpeg_quality None: full pictures."""
 
     hz: float
     pose_hz: float | None = None
+    jpeg_quality: int | None = None
+
+    @property
+    def size(self) -> float:
+        """Size of its keyframes, beside ones with full pictures."""
+        return 1.0 if self.jpeg_quality is None else SMALL_SIZE
 
 
 @dataclass(frozen=True)
@@ -121,7 +138,7 @@ class RoomBudget:
             }
             filtered = {
                 key: then + weight * (min(getattr(reported, key), most.get(key, math.inf)) - then)
-                for key in ("keyframe_s", "arrival_s", "hz", "pose_hz")
+                for key in ("keyframe_s", "arrival_s", "hz", "pose_hz", "size")
                 for then in [getattr(before, key)]
             }
             reported = replace(reported, **filtered)
@@ -184,11 +201,20 @@ class RoomBudget:
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
         """Whether not everyone can send what it wants with a wait of less than `wait_ms` for others."""
+        return self._is_short([self.airtime_s(agent) for agent in self.agents.values()], wait_ms)
+
+    def needs_small_pictures(self, part: float = 1.0) -> bool:
+        """Whether the air is short, or slow, for full pictures. part: of both limits, for a hysteresis."""
+        full_s = [self.airtime_s(agent) / agent.size for agent in self.agents.values()]
+        is_slow = 1e3 * (_low_median(full_s) or 0.0) > part * SLOW_KEYFRAME_MS
+        return is_slow or self._is_short(full_s, part * FREE_WAIT_MS)
+
+    def _is_short(self, airtime_s: Sequence[float], wait_ms: float) -> bool:
+        """Return `is_short` if keyframes took airtime_s (N,), in the order of `agents`, alone."""
         messages_hz, load = FULL_POSE_HZ + OTHER_HZ, 0.0
-        for agent in self.agents.values():
-            airtime_s = self.airtime_s(agent)
-            load += agent.wanted_hz * airtime_s + messages_hz * message_s(airtime_s)
-        return load > most_load(self.median_airtime_s or 0.0, wait_ms)
+        for agent, keyframe_s in zip(self.agents.values(), airtime_s, strict=True):
+            load += agent.wanted_hz * keyframe_s + messages_hz * message_s(keyframe_s)
+        return load > most_load(_low_median(airtime_s) or 0.0, wait_ms)
 
     def allocate(
         self, waits_ms: Sequence[float] = (FREE_WAIT_MS,), before: Mapping[str, RateGrant] | None = None
@@ -246,5 +272,5 @@ def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
 
 
 def scarce_grant(form: AgentKind, hz: float) -> RateGrant:
-    """Return what an agent may send where the air is short: few poses."""
-    return RateGrant(hz, SCARCE_POSE_HZ[form])
+    """Return what an agent may send where the air is short: few poses and small pictures."""
+    return RateGrant(hz, SCARCE_POSE_HZ[form], SMALL_JPEG_QUALITY)

@@ -9,6 +9,8 @@ from share.scheduling.rate_allocation import STEP_HZ
 from share.scheduling.room_budget import (
     FREE_WAIT_MS,
     SILENT_S,
+    SMALL_JPEG_QUALITY,
+    SMALL_SIZE,
     AgentDemand,
     RateGrant,
     RoomBudget,
@@ -70,7 +72,7 @@ class RoomController:
         self._counts: dict[str, tuple[int, tuple[int, int]]] = {}  # time, ns, keyframes and poses
         self._last: dict[str, AgentDemand] = {}  # newest report of each, of the silent too
         self._grants: dict[str, RateGrant] = {}
-        self._allocated_ns, self._is_short = 0, False
+        self._allocated_ns, self._is_short, self._has_small_pictures = 0, False, False
         self._cut: dict[str, tuple[float, int]] = {}  # rates that were cut, and since when they may rise
         self._start = StaggeredStart()
         self._starting: dict[str, int] = {}  # agents whose air is not known, and when they joined
@@ -115,6 +117,7 @@ class RoomController:
             pose_hz=pose_hz,
             updated_ns=now_ns,
             is_placed=is_placed,
+            size=self._grants[name].size if name in self._grants else SMALL_SIZE,
         )
         if not air.keyframes:  # no keyframe has arrived that would confirm its report
             return self.first_grant(terms.form, now_ns)
@@ -131,10 +134,13 @@ class RoomController:
     def _allocate(self, now_ns: int) -> None:
         """Allocate the airtime anew, with hysteresis: once scarce, the air counts as scarce until keyframes
         wait for less than `_PLENTY` of the limit; a rate stays while it is between what both waits allow."""
-        self._allocated_ns, plenty_ms = now_ns, _PLENTY * FREE_WAIT_MS
-        self._is_short = self._budget.is_short(plenty_ms if self._is_short else FREE_WAIT_MS)
+        budget, self._allocated_ns, plenty_ms = self._budget, now_ns, _PLENTY * FREE_WAIT_MS
+        self._has_small_pictures = budget.needs_small_pictures(_PLENTY if self._has_small_pictures else 1.0)
+        is_short = budget.is_short(plenty_ms if self._is_short else FREE_WAIT_MS)
+        self._is_short = self._has_small_pictures and is_short
         if not self._is_short:
-            self._grants = {n: RateGrant(agent.wanted_hz) for n, agent in self._budget.agents.items()}
+            quality = SMALL_JPEG_QUALITY if self._has_small_pictures else None
+            self._grants = {n: RateGrant(a.wanted_hz, None, quality) for n, a in budget.agents.items()}
             return
         before = self._grants
         least, most = self._budget.allocate((plenty_ms, FREE_WAIT_MS), before)

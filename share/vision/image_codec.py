@@ -67,9 +67,11 @@ def depth_metres(raw: NDArray[Any], depth_scale: float, where: str) -> F32:
     return np.asarray(raw / np.float32(depth_scale), np.float32)
 
 
-def encode_jpeg(image: U8, quality: int) -> bytes:
-    """Encode (H, W) uint8 as JPEG."""
-    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+def encode_jpeg(image: U8, quality: int, is_optimized: bool = False) -> bytes:
+    """Encode (H, W) uint8 as JPEG. is_optimized: with Huffman tables of its own, 8 to 16 % smaller in twice
+    the time."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, int(is_optimized)]
+    return bytes(cv2.imencode(".jpg", image, options)[1])
 
 
 def image_format(data: bytes) -> str:

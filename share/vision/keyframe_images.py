@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -52,10 +52,19 @@ def compress(image: U8) -> U8:
     if image.size > MAX_IMAGE_PIXELS:
         return np.zeros(0, np.uint8)
     for quality in _JPEG_QUALITIES:
-        jpeg = encode_jpeg(image, quality)
+        jpeg = encode_jpeg(image, quality, is_optimized=True)
         if len(jpeg) <= MAX_JPEG_BYTES:
             return np.frombuffer(jpeg, np.uint8)
     return np.zeros(0, np.uint8)
+
+
+def with_less_quality(image: KeyframeImage, quality: int) -> KeyframeImage:
+    """Return the same with its JPEG, of our own making, compressed again; unchanged if that saves nothing."""
+    if not len(image.jpeg):
+        return image
+    pixels = decode_gray(image.jpeg.tobytes(), "our own keyframe's image")
+    jpeg = np.frombuffer(encode_jpeg(pixels, quality, is_optimized=True), np.uint8)
+    return replace(image, jpeg=jpeg) if len(jpeg) < len(image.jpeg) else image
 
 
 def image_objection(image: KeyframeImage, camera: Camera) -> str | None:

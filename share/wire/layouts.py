@@ -318,7 +318,9 @@ LAYOUTS: dict[type, MessageLayout] = {
         segment_keyframe=Int64,
         answered_keyframe=Int64,
     ),
-    m.Rate: MessageLayout(20, m.Rate, hz=float, is_windowed=bool, pose_hz=float | None),
+    m.Rate: MessageLayout(
+        20, m.Rate, hz=float, is_windowed=bool, pose_hz=float | None, jpeg_quality=int | None
+    ),
     m.Pong: MessageLayout(
         21, m.Pong, sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64
     ),

@@ -206,17 +206,21 @@ class Ack:
 @dataclass(frozen=True)
 class Rate:
     """Keyframes a second that the agent may send. is_windowed: and only while those that are not
-    acknowledged are few (`share.protocol.keyframe_pace`). pose_hz: poses a second; None: every one."""
+    acknowledged are few (`share.protocol.keyframe_pace`). pose_hz: poses a second; None: every one.
+    jpeg_quality: of the keyframes' pictures; None: as good as they are made."""
 
     hz: float
     is_windowed: bool = False
     pose_hz: float | None = None
+    jpeg_quality: int | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.hz <= MAX_RATE_HZ:
             raise ValueError(f"rate: {self.hz} Hz is outside 0 .. {MAX_RATE_HZ:g}")
         if self.pose_hz is not None and not MIN_POSE_HZ <= self.pose_hz <= MAX_RATE_HZ:
             raise ValueError(f"pose_hz: {self.pose_hz} is outside {MIN_POSE_HZ:g} .. {MAX_RATE_HZ:g}")
+        if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality: {self.jpeg_quality} is outside 1 .. 100")
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ TERMS = {kind: QoeParameters.from_config(ControlConfig(), kind) for kind in Agen
 
 
 class Air:
-    """A channel on which a keyframe alone takes `alone_ms`. noise: of what each measures, sigma of its
-    logarithm. robots_hz: what robots want. history: rates of all agents every 0.5 s."""
+    """A channel on which a keyframe with a full picture takes `alone_ms` alone. noise: of what each measures,
+    sigma of its logarithm. robots_hz: what robots want. history: rates of all agents every 0.5 s."""
 
     def __init__(
         self,
@@ -47,13 +47,14 @@ class Air:
     def load(self) -> float:
         alone_s = self.alone_ms / 1e3
         messages_hz = sum(OTHER_HZ + (30.0 if g.pose_hz is None else g.pose_hz) for g in self.grants)
-        return min(0.98, alone_s * sum(g.hz for g in self.grants) + messages_hz * message_s(alone_s))
+        keyframes_s = alone_s * sum(g.hz * g.size for g in self.grants)
+        return min(0.98, keyframes_s + messages_hz * message_s(alone_s))
 
     def play(self, seconds: float) -> None:
         end = self.now_s + seconds
         while self.now_s < end:
             self.now_s += STEP_S
-            self._report(self.alone_ms / (1 - self.load()))
+            self._report()
             self.history.append([g.hz for g in self.grants])
 
     def pause(self, seconds: float) -> None:
@@ -63,12 +64,14 @@ class Air:
         for waited_s in range(1, int(seconds) + 1):
             self._report(1e3 * waited_s, began_s + waited_s)
 
-    def _report(self, keyframe_ms: float, sent_s: float | None = None) -> None:
+    def _report(self, waited_ms: float | None = None, sent_s: float | None = None) -> None:
+        full_ms = self.alone_ms / (1 - self.load())
         for k, kind in enumerate(self.kinds):
             sent, pose_hz = self.grants[k].hz, self.grants[k].pose_hz
             if sent_s is None:  # during a pause nothing arrives
                 self.counts[k][0] += STEP_S * sent
                 self.counts[k][1] += STEP_S * (30.0 if pose_hz is None else pose_hz)
+            keyframe_ms = full_ms * self.grants[k].size if waited_ms is None else waited_ms
             air_ms = keyframe_ms * self._noisy()
             told = Evaluation(0, 60 + air_ms, 1.2, 10.0, 5.0, 5 + air_ms, 0.5)
             counts = round(self.counts[k][0]), round(self.counts[k][1])

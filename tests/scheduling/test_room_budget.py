@@ -20,6 +20,7 @@ from share.scheduling.room_budget import (
     RoomBudget,
     first_grant,
     message_s,
+    scarce_grant,
 )
 from share.scheduling.room_controller import AirtimeMeasurement, RoomController
 from share.types import AgentKind
@@ -65,6 +66,24 @@ def test_where_the_air_is_short_robots_yield_and_poses_are_thinned() -> None:
     )
     assert max(robots) < min(headsets)
     assert air.load() < 0.4
+
+
+@pytest.mark.parametrize(("alone_ms", "is_small"), [(2.0, False), (6.0, False), (18.0, True), (34.0, True)])
+def test_pictures_are_small_where_full_ones_take_long_and_stay_so(alone_ms: float, is_small: bool) -> None:
+    """Though small ones take little: at 18 ms the air is not short any more. Two headsets and a robot."""
+    air = Air(alone_ms, (AR, AR, ROBOT), noise=0.1)
+    air.play(20)
+    for _ in range(40):
+        air.play(1)
+        assert [grant.jpeg_quality is not None for grant in air.grants] == [is_small] * 3
+
+
+def test_pictures_are_full_again_after_the_air_clears() -> None:
+    air = Air(34.0, (AR, AR, ROBOT))
+    air.play(20)
+    air.alone_ms = 3.0
+    air.play(20)
+    assert all(grant == RateGrant(1.5) for grant in air.grants)
 
 
 @pytest.mark.parametrize("alone_ms", [18.0, 34.0, 54.0])
@@ -143,7 +162,7 @@ def test_a_robot_delays_no_headset_unless_it_has_the_ar_form() -> None:
     bob = ControlConfig(agents={"bob": AgentQoe(form="ar")})
     urgent = replace(agent(ROBOT), terms=QoeParameters.from_config(bob, ROBOT, "bob"))
     granted = room(agent(AR), agent(ROBOT), urgent).allocate()[0]
-    assert granted["a1"] == RateGrant(LEAST_HZ[ROBOT], SCARCE_POSE_HZ[ROBOT])
+    assert granted["a1"] == scarce_grant(ROBOT, LEAST_HZ[ROBOT])
     assert granted["a2"] == granted["a0"]
     among_robots = room(agent(ROBOT), agent(ROBOT)).allocate()[0]
     assert among_robots["a0"].hz > LEAST_HZ[ROBOT]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.modelled_air import STEP_S, Air
 
-from share.scheduling.room_budget import LEAST_HZ
+from share.scheduling.room_budget import LEAST_HZ, SMALL_SIZE
 from share.types import AgentKind
 
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
@@ -28,16 +28,17 @@ def settled(air: Air, since_s: float, until_s: float) -> bool:
 
 
 def test_half_the_air() -> None:
-    """9 ms a keyframe, for 30 s twice as much: headsets yield within 17 s, and have it back after 8."""
-    air = Air(9.0, ROOM)
+    """9 ms a keyframe with a small picture, for 30 s twice as much: headsets yield within 17 s, are back
+    after 8."""
+    air = Air(9.0 / SMALL_SIZE, ROOM)
     air.play(30)
     before = [rates[-1] for rates in headsets(air, 20, 30)]
-    air.alone_ms = 18.0
+    air.alone_ms *= 2
     air.play(30)
     assert settled(air, 47, 60)
     assert all(rates[-1] <= 1 for rates in headsets(air, 30, 60))
     assert all(min(rates) >= LEAST_HZ[AR] for rates in headsets(air, 30, 60))
-    air.alone_ms = 9.0
+    air.alone_ms /= 2
     air.play(20)
     assert settled(air, 68, 80)
     assert [rates[-1] for rates in headsets(air, 68, 80)] == pytest.approx(before, abs=_STEP_HZ)
@@ -77,7 +78,7 @@ def test_what_each_measures_is_noisy_and_rates_stand_all_the_same(alone_ms: floa
 
 
 def test_robots_yield_before_headsets_where_the_air_is_just_short() -> None:
-    air = Air(12.0, ROOM, robots_hz=5.0, noise=0.25)
+    air = Air(12.0 / SMALL_SIZE, ROOM, robots_hz=5.0, noise=0.25)
     air.play(60)
     for kind, hz in zip(ROOM, air.history[-1], strict=True):
         assert hz == 1.5 if kind is AR else hz < 3

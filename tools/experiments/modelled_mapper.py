@@ -34,6 +34,7 @@ from share.wire.messages import Hello
 
 _COARSE_M = 1.0  # sampling interval of the overlap
 _COV = np.diag([1e-5] * 3 + [1e-4] * 3)
+_USUAL_QUANTUM = 16  # of JPEG quality 50
 _CACHE_SIZE = 50_000  # pairs of a keyframe and an agent: some 100 MB
 
 
@@ -45,7 +46,8 @@ class RecognitionModel:
     probability 1/2, by a logistic curve of width `logistic_width`. `overlap_noise`: sigma of the overlap by
     which candidates are ranked. `false_match_rate`: fraction of all keyframes that look alike by chance.
     `sigma_m`, `sigma_rad`: error of a solved pose on each axis, and about the vertical. `supporting_loops`:
-    verified pairs of keyframes that merge two maps.
+    verified pairs of keyframes that merge two maps. `small_recall`, `small_error`: factors of the probability
+    and of the error where a picture is small.
     """
 
     half_overlap: float = 0.5
@@ -55,6 +57,8 @@ class RecognitionModel:
     sigma_m: float = 0.006
     sigma_rad: float = 0.001
     supporting_loops: int = 2
+    small_recall: float = 0.95
+    small_error: float = 1.1
 
 
 class GroundTruth:
@@ -93,6 +97,13 @@ class ModelledStep:
 
     def run(self, _solver: object = None) -> object:
         return self.action()
+
+
+def has_small_picture(keyframe: Keyframe) -> bool:
+    """Return whether its JPEG has a quality below 50, by the first number of its quantisation table."""
+    jpeg = keyframe.image.jpeg.tobytes()
+    start = jpeg.find(b"\xff\xdb")  # marker, length (2), table's number, table: ITU-T T.81, B.2.4.1
+    return start >= 0 and jpeg[start + 5] > _USUAL_QUANTUM
 
 
 @dataclass
@@ -257,6 +268,8 @@ class ModelledMapper:
         a, b = self._stored[candidate], self._stored[number]
         shared = float(self._overlap(number, self._agents[a.agent])[a.truth_index])
         chance = (1 + math.tanh((shared - self._model.half_overlap) / (2 * self._model.logistic_width))) / 2
+        if has_small_picture(a.keyframe) or has_small_picture(b.keyframe):
+            chance *= self._model.small_recall
         if self._rng.random() >= chance or not shared:
             return Refusal("drawn")
         return Verification(se3.inverse(a.T_world_body) @ b.T_world_body, _COV, 40, 30)
@@ -303,6 +316,7 @@ class ModelledMapper:
         run.published_map = run.map_id
         keyframe = self._stored[run.keyframe_numbers[answer]]  # -1: the newest
         sigma = np.array([0.0, 0.0, self._model.sigma_rad] + [self._model.sigma_m] * 3)
+        sigma *= self._model.small_error if has_small_picture(keyframe.keyframe) else 1.0
         xi = self._rng.standard_normal(6) * sigma
         T_map_body = self._T_map_world[run.map_id] @ keyframe.T_world_body @ se3.exp(xi)
         T_odom_body = keyframe.keyframe.T_odom_body
