@@ -42,13 +42,11 @@ SLOW_START_HZ = 2.0  # Hz, of an agent that sends its first keyframes
 FREE_WAIT_MS = 5.0  # a quarter of the delay that a wearer notices
 SLOW_KEYFRAME_MS = 10.0  # on the air: half of what a wearer notices
 SMALL_JPEG_QUALITY = 20  # of small pictures; those that agents make have 50
-SMALL_SIZE = (
-    0.45  # of a keyframe with a small picture, beside one with a full one (docs/lab/scheduling-figures.md)
-)
+SMALL_SIZE = 0.57  # of a keyframe with a small picture, beside one with a full one (110 recordings)
 SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
-# air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a keyframe's
-_MESSAGE_S, _MESSAGE_PART = 3e-4, 0.006
+# air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a full keyframe's
+_MESSAGE_S, _MESSAGE_PART = 3e-4, 0.008
 OTHER_HZ = (
     8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
 )
@@ -168,7 +166,7 @@ class RoomBudget:
     @cached_property
     def _keyframes_hz(self) -> float:
         """L + k M."""
-        return sum(a.hz + _MESSAGE_PART * a.messages_hz for a in self.agents.values())
+        return sum(a.hz + _MESSAGE_PART / a.size * a.messages_hz for a in self.agents.values())
 
     @cached_property
     def _idle(self) -> float:
@@ -201,20 +199,21 @@ class RoomBudget:
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
         """Whether not everyone can send what it wants with a wait of less than `wait_ms` for others."""
-        return self._is_short([self.airtime_s(agent) for agent in self.agents.values()], wait_ms)
+        agents = self.agents.values()
+        return self._is_short([(self.airtime_s(agent), agent.size) for agent in agents], wait_ms)
 
     def needs_small_pictures(self, part: float = 1.0) -> bool:
         """Whether the air is short, or slow, for full pictures. part: of both limits, for a hysteresis."""
         full_s = [self.airtime_s(agent) / agent.size for agent in self.agents.values()]
         is_slow = 1e3 * (_low_median(full_s) or 0.0) > part * SLOW_KEYFRAME_MS
-        return is_slow or self._is_short(full_s, part * FREE_WAIT_MS)
+        return is_slow or self._is_short([(one, 1.0) for one in full_s], part * FREE_WAIT_MS)
 
-    def _is_short(self, airtime_s: Sequence[float], wait_ms: float) -> bool:
-        """Return `is_short` if keyframes took airtime_s (N,), in the order of `agents`, alone."""
+    def _is_short(self, keyframes: Sequence[tuple[float, float]], wait_ms: float) -> bool:
+        """Return `is_short` if the keyframes of `agents`, in their order, had these T, s, and sizes."""
         messages_hz, load = FULL_POSE_HZ + OTHER_HZ, 0.0
-        for agent, keyframe_s in zip(self.agents.values(), airtime_s, strict=True):
-            load += agent.wanted_hz * keyframe_s + messages_hz * message_s(keyframe_s)
-        return load > most_load(_low_median(airtime_s) or 0.0, wait_ms)
+        for agent, (airtime_s, size) in zip(self.agents.values(), keyframes, strict=True):
+            load += agent.wanted_hz * airtime_s + messages_hz * message_s(airtime_s, size)
+        return load > most_load(_low_median([one for one, _ in keyframes]) or 0.0, wait_ms)
 
     def allocate(
         self, waits_ms: Sequence[float] = (FREE_WAIT_MS,), before: Mapping[str, RateGrant] | None = None
@@ -233,13 +232,14 @@ class RoomBudget:
         agents = list(self.agents.values())
         forms = [agent.terms.form for agent in agents]
         airtime_s = np.array([self.airtime_s(agent) for agent in agents])
+        sizes = np.array([agent.size for agent in agents])
         pose_hz = np.array([SCARCE_POSE_HZ[form] for form in forms])
         error_cm = np.array([math.nan if a.error_cm is None else a.error_cm for a in agents])
         return AirDemand(
             terms=QoeTable.of([agent.terms for agent in agents]),
             airtime_s=airtime_s,
             median_airtime_s=self.median_airtime_s or 0.0,
-            message_load=float((pose_hz + OTHER_HZ) @ message_s(airtime_s)),
+            message_load=float((pose_hz + OTHER_HZ) @ message_s(airtime_s, sizes)),
             weight=np.array([_WEIGHT[form] for form in forms]),
             least_hz=np.array([agent.least_hz for agent in agents]),
             wanted_hz=np.array([agent.wanted_hz for agent in agents]),
@@ -256,14 +256,14 @@ def _low_median(values: Sequence[float]) -> float | None:
     return None if not values else median(values) if len(values) > 2 else min(values)
 
 
-def message_s(keyframe_s: Seconds) -> Seconds:
-    """Return how long a small message takes on the air on which a keyframe takes keyframe_s."""
-    return _MESSAGE_S + _MESSAGE_PART * keyframe_s
+def message_s(keyframe_s: Seconds, size: Seconds | float = 1.0) -> Seconds:
+    """Return how long a small message takes on the air on which a keyframe of this size takes keyframe_s."""
+    return _MESSAGE_S + _MESSAGE_PART * keyframe_s / size
 
 
 def least_load(form: AgentKind, keyframe_s: float) -> float:
-    """Return the load of an agent that sends as little as it may."""
-    return LEAST_HZ[form] * keyframe_s + (SCARCE_POSE_HZ[form] + OTHER_HZ) * message_s(keyframe_s)
+    """Return the load of an agent that sends as little as it may, keyframes with small pictures."""
+    return LEAST_HZ[form] * keyframe_s + (SCARCE_POSE_HZ[form] + OTHER_HZ) * message_s(keyframe_s, SMALL_SIZE)
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from share.scheduling.rate_allocation import MAX_LOAD
-from share.scheduling.room_budget import RoomBudget, least_load
+from share.scheduling.room_budget import SMALL_SIZE, RoomBudget, least_load
 from share.timing import seconds_to_ns
 from share.types import AgentKind
 
@@ -72,11 +72,14 @@ class RoomCapacity:
 
 def crowded_air_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[str] = ()) -> float:
     """Return how long a keyframe takes on the air, T / (1 - load), once one agent has joined and others have
-    left, all at their least rates; inf beyond what the air carries, 0 where too few know the air."""
+    left, all at their least rates, with small pictures; inf beyond what the air carries, 0 where too few know
+    the air."""
     if len(budget.agents) < _MIN_REPORTS:
         return 0.0
     staying = [agent.terms.form for name, agent in budget.agents.items() if name not in leaving]
-    airtime_s = _lower_quartile(map(budget.airtime_s, budget.agents.values()))
+    airtime_s = _lower_quartile(
+        SMALL_SIZE * budget.airtime_s(agent) / agent.size for agent in budget.agents.values()
+    )
     load = sum(least_load(form, airtime_s) for form in [joining, *staying])
     return math.inf if load >= MAX_LOAD else 1e3 * airtime_s / (1 - load)
 

@@ -43,7 +43,7 @@ class StepwiseAllocation:
 
     def _load(self, hz: dict[str, float]) -> float:
         messages = sum(
-            (SCARCE_POSE_HZ[one.terms.form] + OTHER_HZ) * message_s(self._airtime_s[n])
+            (SCARCE_POSE_HZ[one.terms.form] + OTHER_HZ) * message_s(self._airtime_s[n], one.size)
             for n, one in self._agents.items()
         )
         return min(MAX_LOAD, messages + sum(hz[n] * self._airtime_s[n] for n in hz))
