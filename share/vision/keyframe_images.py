@@ -59,10 +59,13 @@ def compress(image: U8) -> U8:
 
 
 def with_less_quality(image: KeyframeImage, quality: int) -> KeyframeImage:
-    """Return the same with its JPEG, of our own making, compressed again; unchanged if that saves nothing."""
+    """Return the same with its JPEG compressed again; unchanged if it is damaged, or that saves nothing."""
     if not len(image.jpeg):
         return image
-    pixels = decode_gray(image.jpeg.tobytes(), "our own keyframe's image")
+    try:
+        pixels = decode_gray(image.jpeg.tobytes(), "image")
+    except DataError:
+        return image
     jpeg = np.frombuffer(encode_jpeg(pixels, quality, is_optimized=True), np.uint8)
     return replace(image, jpeg=jpeg) if len(jpeg) < len(image.jpeg) else image
 

@@ -17,6 +17,7 @@ from share.protocol import agent_events as ev
 from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.types import Correction, Keyframe, KeyframeImage, OdometryKeyframe, TrackState, View
+from share.vision.keyframe_images import compress
 from share.wire import messages as m
 from share.wire.codec import WIRE_VERSION, decode, encode, message_bytes
 
@@ -335,6 +336,24 @@ def test_the_rate_limit_is_a_token_bucket() -> None:
     for keyframe in keyframes:  # the chain still leads to where the body was
         T = T @ keyframe.T_ref_body
         assert T[0, 3] == pytest.approx((keyframe.stamp_ns - 10**15) / (50 * MS))
+
+
+def test_pictures_have_the_quality_that_the_edge_asks_for() -> None:
+    rng, agent = np.random.default_rng(3), welcomed()
+    made = replace(KeyframeImage.empty(), jpeg=compress(rng.integers(0, 256, (48, 64), np.uint8)))
+
+    def sent_bytes(k: int) -> int:
+        frame = tracked(4 * k, pose(k), candidate=True)
+        handle(agent, replace(frame, is_keyframe=False), 200 * k * MS)
+        candidate = OdometryKeyframe(pose(k), pose(1), COV, UP, 0.01, View.empty(), image=made)
+        effects = agent.handle(ev.KeyframeMade(frame, candidate), 200 * k * MS)
+        return len(only(Keyframe, effects, messages=True)[0].image.jpeg)
+
+    assert sent_bytes(0) == len(made.jpeg)
+    tell(agent, m.Rate(m.MAX_RATE_HZ, jpeg_quality=10), 100 * MS)
+    assert sent_bytes(1) < 0.7 * len(made.jpeg)
+    tell(agent, m.Rate(m.MAX_RATE_HZ), 300 * MS)
+    assert sent_bytes(2) == len(made.jpeg)
 
 
 def test_distant_views_are_preferred_at_the_same_rate() -> None:

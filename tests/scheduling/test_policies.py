@@ -222,6 +222,8 @@ def test_fixed_is_one_rate_for_all_from_the_first_keyframe_on() -> None:
         for delay_ms in (10.0, 9e3):
             told = Evaluation(0, delay_ms, 3.0)
             assert fixed.evaluate("ann", report(kind, 1.0, told)) == RateGrant(0.7)
+    small = made("fixed", replace(CONFIG, fixed_rate_hz=0.7, fixed_jpeg_quality=20))
+    assert small.first_grant("ann", AgentKind.AR, 0) == RateGrant(0.7, None, 20)
     capped = made("fixed", replace(CONFIG, fixed_rate_hz=99.0))
     assert capped.first_grant("ann", AgentKind.AR, 0) == RateGrant(CONFIG.rate_max_hz)
 

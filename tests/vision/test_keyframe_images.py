@@ -29,6 +29,7 @@ from share.vision.keyframe_images import (
     compress,
     decompress,
     image_objection,
+    with_less_quality,
 )
 
 CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
@@ -138,6 +139,22 @@ def test_an_image_survives_compression() -> None:
     assert decoded is not None and decoded.dtype == np.uint8
     assert np.abs(decoded.astype(float) - picture()).mean() < 3
     assert image_objection(image, CAMERA) is None
+
+
+def test_a_small_picture_is_the_same_view_in_fewer_bytes() -> None:
+    shown = picture()
+    full = replace(image_of(), jpeg=compress(shown))
+    small = with_less_quality(full, 20)
+    assert len(small.jpeg) < 0.7 * len(full.jpeg) and image_objection(small, CAMERA) is None
+    decoded = decompress(small, CAMERA)
+    assert decoded is not None and np.abs(decoded.astype(int) - shown).mean() < 6
+    assert np.array_equal(small.uv, full.uv) and np.array_equal(small.rho_sigma, full.rho_sigma)
+
+
+def test_compressing_again_keeps_what_it_cannot_make_smaller() -> None:
+    full = replace(image_of(), jpeg=compress(picture()))
+    for image in (KeyframeImage.empty(), image_of(), with_less_quality(full, 20)):
+        assert with_less_quality(image, 95) is image
 
 
 def test_an_image_of_noise_is_compressed_more_and_one_that_never_fits_is_left_out() -> None:
