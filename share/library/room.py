@@ -125,6 +125,7 @@ class RoomThread(BackgroundRun):
         position: m in the map; yaw: rad. map_id: None: that of your agent, or the only one. Raises ShareError
         if it is refused, or not answered in time: then it is placed as soon as the edge answers.
         """
+        _check_name("map_id", map_id)
         chosen = secrets.randbelow(2**31) if object_id is None else object_id
         message = placed(next(self._link.numbers), chosen, kind, position, yaw, map_id)
         self._ask(message, timeout_s)
@@ -158,6 +159,8 @@ class RoomThread(BackgroundRun):
     ) -> RobotGoal:
         """Send a robot to a place: m, rad. robot: None: the only one; map_id: None: the robot's. Returns at
         once."""
+        _check_name("robot", robot)
+        _check_name("map_id", map_id)
         command = next(self._link.numbers)
         try:
             message = Goto(command, robot, "", map_id, x, y, yaw)
@@ -173,6 +176,7 @@ class RoomThread(BackgroundRun):
 
     def stop_robot(self, robot: str | None = None) -> None:
         """Stop a robot, whoever sent it. Returns at once."""
+        _check_name("robot", robot)
         try:
             message = Cancel(next(self._link.numbers), robot)
         except (ValueError, TypeError) as error:
@@ -233,6 +237,11 @@ class RoomThread(BackgroundRun):
         end_s = time.monotonic() + 1.0
         while not self._link.client.is_idle and time.monotonic() < end_s:
             self._step()
+
+
+def _check_name(argument: str, value: str | None) -> None:
+    """Raise UsageError if an argument that may be left out is no text."""
+    checked_kind(argument, value, (str, type(None)), "a name, or None")
 
 
 def placed(

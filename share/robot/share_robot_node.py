@@ -391,22 +391,21 @@ def main() -> int:
     except (OSError, ValueError) as error:
         parser.error(str(error))
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     topics = RobotTopics(options.namespace)
     link = BridgeLink(topics, options.bridge, keys or None)
     link.start()
-    code = 1
+    stops: list[int] = []  # noted, not raised: a second one must not break off the robot's stop
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda one, _frame: stops.append(one))
     try:
-        while link.is_alive():
-            rclpy.spin_once(topics.node, timeout_sec=0.5)
-    except KeyboardInterrupt:
-        code = 0
+        while link.is_alive() and not stops:
+            rclpy.spin_once(topics.node, timeout_sec=0.1)
     finally:  # however it ends, the robot stops
         link.is_ended = True
         link.join()
         link.cancel_all()
         rclpy.spin_once(topics.node, timeout_sec=0.2)
-    return code
+    return 0 if stops else 1
 
 
 if __name__ == "__main__":

@@ -110,6 +110,10 @@ def test_arguments_of_another_type_are_refused_at_once(server) -> None:
             room.remove(7.0)  # type: ignore[arg-type]
         with pytest.raises(UsageError, match="x: has to be a number, not bool"):
             room.goto(True, 2.0)
+        with pytest.raises(UsageError, match="map_id: is a int, expected a name, or None"):
+            room.put("cube", (1, 2, 0), map_id=5)  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match="robot: is a int, expected a name, or None"):
+            room.goto(1, 2, robot=5)  # type: ignore[arg-type]
         for name in ("a/b", 7):
             with pytest.raises(UsageError):
                 room.stop_robot(name)  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import importlib.util
 import json
 import os
 import secrets
+import signal
 import subprocess
 import sys
 import threading
@@ -314,6 +315,21 @@ def test_the_command_prints_a_file_that_needs_no_share(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rclpy") is not None, reason="rclpy is installed here")
+@pytest.mark.parametrize("signals", [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT,) * 3])
+def test_however_often_it_is_stopped_the_node_cancels_its_goal(signals: tuple[int, ...]) -> None:
+    """A second Ctrl-C came while it stopped, and broke that off."""
+    child = Path(__file__).parents[1] / "helpers" / "node_without_ros.py"
+    command = [sys.executable, str(child), str(Path(robot_node.__file__).parent)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "UP\n"
+        for number in signals:
+            process.send_signal(number)
+            time.sleep(0.001)
+        printed = process.stdout.read()
+    assert "CANCEL" in printed and process.returncode == 0
+
+
 def test_without_rclpy_it_says_what_to_do(monkeypatch, capsys) -> None:
     monkeypatch.setattr(sys, "argv", ["share_robot_node.py", "tcp://127.0.0.1:5580"])
     with pytest.raises(SystemExit) as ended:
