@@ -159,8 +159,10 @@ def drag_marker(page: BrowserPage, seconds: float) -> None:
 
 # Notes when a marker is drawn where, ms of the wall clock.
 SEEN = """(seen = [], () => {
+    frameTimes = [];
     const note = () => {
         requestAnimationFrame(note);
+        frameTimes.push(performance.now());
         const one = [...app.room.objects.values()].find((one) => one.kind === "marker");
         if (one) seen.push([performance.timeOrigin + performance.now(), one.shown[12], one.shown[13]]);
     };
@@ -175,3 +177,8 @@ def lateness_ms(first: BrowserPage, second: BrowserPage) -> F64:
         for at_ms, x, y in page.evaluate("seen"):
             times.setdefault((round(x, 4), round(y, 4)), at_ms)
     return np.array([at_ms - drawn[place] for place, at_ms in seen.items() if place in drawn])
+
+
+def frame_ms(page: BrowserPage) -> float:
+    """Return the time between two frames of a page, median, ms, by `SEEN`."""
+    return float(np.median(np.diff(page.evaluate("frameTimes"))))
