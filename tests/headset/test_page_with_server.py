@@ -76,11 +76,14 @@ def test_two_wearers_share_a_marker(stack, tmp_path, monkeypatch) -> None:
         page.evaluate("walks = true")
         page.wait("app.place.mapId !== null && app.alignmentMm !== null")
         pages.append(page)
-    time.sleep(3.0)
     for page in pages:
-        errors = np.array([worn.drawn_error(page) for _ in range(20)])
+        end = time.monotonic() + 60.0  # on a busy machine the page learns the server's clock slowly
+        while True:
+            errors = np.array([worn.drawn_error(page) for _ in range(20)])
+            if np.median(errors[:, 0]) < 0.01:
+                break
+            assert time.monotonic() < end, errors
         print("drawn within {:.1f} mm, {:.2f} deg".format(*np.median(errors, 0) * [1e3, 180 / np.pi]))
-        assert np.median(errors[:, 0]) < 0.01
         page.app(worn.SEEN)
     ann, ben = pages
     worn.drag_marker(ann, 3.0)

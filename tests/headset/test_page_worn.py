@@ -46,9 +46,8 @@ def test_the_room_stays_where_it_is(chromium: Browser, room: HeadsetRoom) -> Non
     print(f"align: {1e3 * np.median(errors, 0)[0]:.1f} mm, {np.degrees(np.median(errors, 0)[1]):.2f} deg")
     assert np.median(errors, axis=0)[0] < 0.01 and np.degrees(np.median(errors, axis=0)[1]) < 0.2
     walk.walks = False
-    page.evaluate("walks = false")
-    page.app("app.interaction.arm('marker')")
-    worn.press(page, True)
+    worn.stand(page)
+    worn.place(page, "marker")
     before = page.wait("[...app.room.objects.values()].map((one) => [...one.T])[0]")
     page.evaluate("(space = { yaw: 1.0, x: 0.4, z: -0.3 }, headset.recenter())")
     page.wait("app.placement.mapId === null || app.commands.notice.text.includes('recentred')")
@@ -134,8 +133,7 @@ def test_memory_does_not_grow(chromium: Browser, room: HeadsetRoom) -> None:
     page = worn.wear(chromium, room.url, "ann")
     walk.walks = True
     page.evaluate("walks = true")
-    page.app("app.interaction.arm('marker')")
-    worn.press(page, True)
+    worn.place(page, "marker")
     page.evaluate(
         "(began = performance.now(), drags = () => {"
         " const s = Math.sin((performance.now() - began) / 1000);"

@@ -133,11 +133,31 @@ def wait_frames(page: BrowserPage, count: int) -> None:
 
 
 def push(page: BrowserPage, button: str) -> None:
-    """Point at a button of the panel and press it."""
-    page.app(f"(aims = {{ ...aims, at: unspaced(app.panel.centreOf({button!r})) }}, 0)")
-    wait_frames(page, 3)
+    """Point at a button of the panel, which follows who walks, and press it."""
+    for _ in range(100):
+        page.app(f"(aims = {{ ...aims, at: unspaced(app.panel.centreOf({button!r})) }}, 0)")
+        wait_frames(page, 2)
+        if page.app("app.panel.hovered?.name") == button:
+            break
     press(page, True)
     press(page, False)
+
+
+def stand(page: BrowserPage) -> None:
+    """End the walk, with the panel before the wearer, where no ray to the floor meets it."""
+    page.app("(walks = false, app.panel.forget(), 0)")
+    wait_frames(page, 3)
+
+
+def place(page: BrowserPage, what: str) -> None:
+    """Pull the trigger on what was armed, until it is there: a panel that followed may have been in the way."""
+    page.app(f"(app.interaction.armed = {what!r}, 0)")
+    for _ in range(100):
+        press(page, True)
+        if page.app("app.interaction.armed === null"):
+            return
+        press(page, False)
+    raise AssertionError(f"no {what} was placed")
 
 
 def drag_marker(page: BrowserPage, seconds: float) -> None:
@@ -145,7 +165,7 @@ def drag_marker(page: BrowserPage, seconds: float) -> None:
     push(page, "marker")
     page.evaluate("aims = { ...aims, at: [0.6, 0, -1.4] }, 0")
     wait_frames(page, 3)
-    press(page, True)
+    place(page, "marker")
     page.evaluate(
         "(began = performance.now(), drags = () => {"
         f" const s = Math.min((performance.now() - began) / {1000 * seconds}, 1);"
