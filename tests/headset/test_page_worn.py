@@ -31,7 +31,9 @@ def test_two_wearers_share_a_marker(chromium: Browser, room: HeadsetRoom) -> Non
     late = worn.lateness_ms(ann, ben)
     frame_ms = max(worn.frame_ms(page) for page in (ann, ben))
     print(f"drawn by the other after {np.percentile(late, [50, 95]).round(1)} ms, {len(late)} places")
-    assert len(late) > 20 and np.median(late) < 60 + 2 * max(frame_ms - 17, 0), frame_ms  # a busy machine's are longer
+    assert len(late) > 20 and np.median(late) < 60 + 2 * max(frame_ms - 17, 0), (
+        frame_ms
+    )  # a busy machine's are longer
     assert ann.problems == ben.problems == []
 
 

@@ -132,13 +132,19 @@ def wait_frames(page: BrowserPage, count: int) -> None:
     page.wait(f"app.frames >= {page.app('app.frames') + count}")
 
 
-def push(page: BrowserPage, button: str) -> None:
-    """Point at a button of the panel, which follows who walks, and press it."""
+def aim(page: BrowserPage, button: str) -> None:
+    """Point at a button of the panel, which follows who walks."""
     for _ in range(100):
         page.app(f"(aims = {{ ...aims, at: unspaced(app.panel.centreOf({button!r})) }}, 0)")
         wait_frames(page, 2)
         if page.app("app.panel.hovered?.name") == button:
-            break
+            return
+    raise AssertionError(f"the button {button} cannot be pushed")
+
+
+def push(page: BrowserPage, button: str) -> None:
+    """Point at a button of the panel and press it."""
+    aim(page, button)
     press(page, True)
     press(page, False)
 
