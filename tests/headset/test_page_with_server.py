@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import emulated_wearer as worn
-from helpers.browser import Browser, BrowserPage
+from helpers.browser import Browser
 
 pytest.importorskip("share.headset.headset_page")
-from helpers.served_room import ServedRoom, served_room  # noqa: E402
+from helpers.served_room import ServedRoom, served_room, wear
 
 pytestmark = pytest.mark.slow
 
@@ -22,21 +21,6 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ServedRo
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     with served_room(tmp_path) as one:
         yield one
-
-
-def wear(chromium: Browser, served: ServedRoom, name: str) -> BrowserPage:
-    """Walk about as `name` until what is drawn stays in its place."""
-    page = worn.wear(chromium, served.url, name, served.next_code())
-    page.evaluate("walks = true")
-    page.wait("app.place.mapId !== null && app.alignmentMm !== null")
-    end = time.monotonic() + 60.0  # on a busy machine the page learns the server's clock slowly
-    while True:
-        errors = np.median([worn.drawn_error(page) for _ in range(20)], axis=0)
-        if errors[0] < 0.01:
-            break
-        assert time.monotonic() < end, errors
-    print("drawn within {:.1f} mm, {:.2f} deg".format(*errors * [1e3, 180 / np.pi]))
-    return page
 
 
 def test_two_wearers_share_a_marker(chromium: Browser, served: ServedRoom) -> None:

@@ -16,11 +16,12 @@ _CHUNK = 65536
 
 
 class DelayedPort:
-    """Forwards connections at `port` of 127.0.0.1 to `target`. Each has delays of its own, by the seed and its number."""
+    """Forwards connections at `port` of 127.0.0.1 to `target`. Each has delays of its own, by the
+    seed and its number."""
 
     def __init__(self, target: tuple[str, int], network: NetworkModel, seed: int) -> None:
         self._target, self._network = target, network
-        self._seeds = np.random.default_rng(seed)
+        self._seeds, self._open, self._is_gone = np.random.default_rng(seed), list[socket.socket](), False
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()
@@ -28,13 +29,24 @@ class DelayedPort:
     def close(self) -> None:
         self._listener.close()
 
+    def cut(self, is_gone: bool) -> None:
+        """End all connections and let no other in, or be there again."""
+        self._is_gone = is_gone
+        while self._open:
+            with contextlib.suppress(OSError):
+                self._open.pop().shutdown(socket.SHUT_RDWR)
+
     def _accept(self) -> None:
         with contextlib.suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
+                if self._is_gone:
+                    near.close()
+                    continue
                 far = socket.create_connection(self._target)
                 for one in (near, far):
                     one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._open += [near, far]
                 up, down = self._seeds.spawn(2)
                 for source, sink, model, rng in (
                     (near, far, self._network.up, up),

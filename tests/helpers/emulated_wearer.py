@@ -99,11 +99,43 @@ def wear(
     page = browser.page(url, *size, emulator())
     page.evaluate(f"(() => {{{_SCRIPT}}})()")
     pair(page, name, name, code)
+    enter(page)
+    return page
+
+
+def enter(page: BrowserPage) -> None:
+    """Enter AR once the page is connected."""
     page.wait("app.connection.isConnected && app.connection.clock.isKnown")
-    page.wait("!document.getElementById('enter').hidden")
     page.click("#enter")
     page.wait("app.isInHeadset && app.frames > 20")
-    return page
+
+
+def open_again(page: BrowserPage, url: str) -> None:
+    """Load the page again, in the same headset."""
+    page.open(url)
+    page.evaluate(f"(() => {{{_SCRIPT}}})()")
+    enter(page)
+
+
+def walk_aligned(page: BrowserPage) -> None:
+    """Walk about until what is drawn stays in its place."""
+    page.evaluate("walks = true")
+    page.wait("app.place.mapId !== null && app.alignmentMm !== null")
+    end = time.monotonic() + 60.0  # on a busy machine the page learns the server's clock slowly
+    while (error_m := np.median([drawn_error(page)[0] for _ in range(20)])) > 0.01:
+        assert time.monotonic() < end, error_m
+
+
+def wait_until_said(page: BrowserPage, text: str, seconds: float = 60.0) -> None:
+    """Wait until the panel says so."""
+    said = "import('/hud.js').then(({ stateLines }) => import('/main.js').then(({ app }) => stateLines(app)))"
+    end = time.monotonic() + seconds
+    while True:
+        lines = [line for line, _ in page.evaluate(said)]
+        if any(text in line for line in lines):
+            return
+        assert time.monotonic() < end, lines
+        time.sleep(0.05)
 
 
 def drawn_error(page: BrowserPage, room_space: F64 | None = None) -> tuple[float, float]:
@@ -156,7 +188,7 @@ def stand(page: BrowserPage) -> None:
 
 
 def place(page: BrowserPage, what: str) -> None:
-    """Pull the trigger on what was armed, until it is there: a panel that followed may have been in the way."""
+    """Pull the trigger until a cube or marker is there: a panel that followed may be in the way."""
     page.app(f"(app.interaction.armed = {what!r}, 0)")
     for _ in range(100):
         press(page, True)
@@ -208,3 +240,30 @@ def lateness_ms(first: BrowserPage, second: BrowserPage) -> F64:
 def frame_ms(page: BrowserPage) -> float:
     """Return the time between two frames of a page, median, ms, by `SEEN`."""
     return float(np.median(np.diff(page.evaluate("frameTimes"))))
+
+
+# Notes where each object is drawn in the room, by the headset's own space, which `space` says the shift of.
+WATCH = """(async () => {
+    const { inverse, identity, transformPoint } = await import("/math.js");
+    const { app } = await import("/main.js");
+    watched = {};
+    const note = () => {
+        requestAnimationFrame(note);
+        if (app.place.mapId === null) return;
+        const T_local_map = inverse(identity(), app.place.T_map_local);
+        for (const [id, one] of app.room.objects) {
+            const p = [...transformPoint([0, 0, 0], T_local_map, one.shown.subarray(12, 15))];
+            (watched[id] ??= []).push(unspaced(p));
+        }
+    };
+    requestAnimationFrame(note);
+})()"""
+
+
+def moved_m(page: BrowserPage, object_id: int) -> tuple[float, float]:
+    """Return how far at most an object was drawn from where it was first, and how far it moved between two
+    frames, by `WATCH`; then begin anew."""
+    drawn = np.array(page.evaluate(f"watched[{object_id}]"))
+    page.evaluate("(watched = {}, 0)")
+    steps = np.linalg.norm(np.diff(drawn, axis=0), axis=1)
+    return float(np.linalg.norm(drawn - np.median(drawn[:5], axis=0), axis=1).max()), float(steps.max())

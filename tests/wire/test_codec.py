@@ -256,7 +256,10 @@ BAD = {
         np.eye(4).tobytes(),
     ],
     "not finite": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
-    "Invalid enum value 'LOSTER'": [header(V, 2, (1, "LOSTER", *POSE_SCALARS[2:]), [("<f8", (4, 4))]), *T_FRAMES],
+    "Invalid enum value 'LOSTER'": [
+        header(V, 2, (1, "LOSTER", *POSE_SCALARS[2:]), [("<f8", (4, 4))]),
+        *T_FRAMES,
+    ],
     "predecessor: 9": bad_keyframe((7, -1, 0, 9, 0.0)),
     "up_sigma: -0.1 is outside 0 .. 1e+06": bad_keyframe((7, -1, 0, 6, -0.1)),
     "view.uv: <f4 of shape (2001, 2)": bad_keyframe(at=4, entry=("<f4", (2001, 2)), data=b"\0" * 16008),

@@ -2,15 +2,17 @@
 
 Both by the references in Python, which the page's modules are held to (tests/headset/test_page_maths.py).
 
-align: seeds of 60 s of walking and looking around, 30 pairs a second; the map's pose errs by 5 mm and 0.08° an axis (one
-sigma), lasting 8 s; the headset's own tracking drifts by 1 mm and 0.0115° an axis in the root of a second and trembles.
-The mount: as exact as a calibration leaves it (1 mm, 0.03°), or 2° wrong about an axis. Errors of the viewer from 2 s on.
-A wrong mount counts as noticed once over a tenth of the newest 100 pairs contradict the alignment, as in the page.
+align: seeds of 60 s of walking and looking around, 30 pairs a second. The map's pose errs by 5 mm and 0.08°
+an axis (one sigma), lasting 8 s; the headset's own tracking drifts by 1 mm and 0.0115° an axis in the root
+of a second, and trembles. The mount: as exact as a calibration leaves it (1 mm, 0.03°), or 2° wrong about
+an axis. Errors of the viewer from 2 s on. A wrong mount counts as noticed once over a tenth of the newest
+100 pairs contradict the alignment, as in the page.
 
-follow: a recorded motion (TUM-VI's truth), of which the moments count in which it turns by at most 1.5 rad/s. 72 frames a
-second, shown 20 ms after the page draws; poses of 30 Hz with the errors above and 0.3 mm, 0.02° more from pose to pose;
-old as a policy makes them (means, half of it constant, half exponential) and then 10 to 30 ms on the way to the page.
-A cube is 1.5 m ahead; 25 px are a degree (Quest 3). In align the headset's prediction of its own pose counts as true.
+follow: a recorded motion (TUM-VI's truth), of which the moments count in which it turns by at most 1.5
+rad/s. 72 frames a second, shown 20 ms after the page draws; poses of 30 Hz with the errors above and 0.3
+mm, 0.02° more from pose to pose, as old as a policy makes them (means; half of it constant, half
+exponential), then 10 to 30 ms on the way to the page. A cube is 1.5 m ahead; 25 px are a degree (Quest 3).
+In align the headset's prediction of its own pose counts as true.
 """
 
 from __future__ import annotations

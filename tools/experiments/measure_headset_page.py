@@ -6,14 +6,15 @@
     python tools/experiments/measure_headset_page.py align [--seeds 500:540]
     python tools/experiments/measure_headset_page.py follow --truth FOLDER/groundtruth.csv [--seeds 500:505]
 
-marker: two wearers, emulated Quest 3s of 320 x 160 px (drawn in software), walk about; one drags a marker along the floor. For each
-place that both drew: by how much later the other drew it, by the wall clock, from frame to frame. Also the times of
-frames, what a frame takes in script, and from a pose's stamp to its frame.
+marker: two wearers, emulated Quest 3s of 320 x 160 px (drawn in software), walk about; one drags a marker
+along the floor. For each place that both drew: by how much later the other drew it, by the wall clock, from
+frame to frame. Also the times of frames, what a frame takes in script, and from a pose's stamp to its
+frame.
 memory: the heap of a page, after collection, while its wearer walks and drags a marker.
-goal: the trigger pulled on "Go there" -> the page hears that a robot's action server has accepted, so the way back is in
-it. Needs SHARE_ROS, an environment with rclpy (CONTRIBUTING.md).
-All three: the edge's own page server, the edge's protocol on a real link without mapper and agents; --link: between each
-page and the server.
+goal: the trigger pulled on "Go there" -> the page hears that a robot's action server has accepted, so the
+way back is in it. Needs SHARE_ROS, an environment with rclpy (CONTRIBUTING.md).
+All three: the edge's own page server, the edge's protocol on a real link without mapper and agents; --link:
+between each page and the server.
 align, follow: `headset_motion.py`.
 """
 
