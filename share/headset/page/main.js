@@ -12,11 +12,12 @@ import { Placement } from "./placement.js";
 import { Preview } from "./preview.js";
 import { Renderer } from "./renderer.js";
 import { Room } from "./room.js";
-import { Scene } from "./scene.js";
+import { LABEL_SHARE, Scene } from "./scene.js";
 
 const MEASURED_MS = 2000;
 const HUD_MS = 200;
 const MAX_AGE_MS = 10000;  // of a pose; beyond, nothing comes: not a latency
+const LABEL_PX = 25;  // on flat screens
 const STOP_BUTTON = 5;  // B and Y of xr-standard gamepads
 
 class App {
@@ -37,7 +38,7 @@ class App {
     #viewProjection = identity();
     #T_view_map = identity();
     #eye = new Float64Array(3);
-    #frame = { mapId: null, floorZ: 0, eye: null, T_map_camera: null, pointers: [], hovered: null, panel: null };
+    #frame = { mapId: null, floorZ: 0, eye: null, labelShare: LABEL_SHARE };
 
     constructor(canvas) {
         this.canvas = canvas;
@@ -193,6 +194,7 @@ class App {
         frame.floorZ = this.place.floorZ;
         frame.eye = eye;
         frame.T_map_camera = this.isInHeadset ? null : this.preview.T_map_camera;
+        frame.labelShare = this.isInHeadset ? LABEL_SHARE : this.preview.shareOf(LABEL_PX);
         frame.pointers = pointers;
         frame.hovered = this.interaction.hovered;
         frame.panel = this.isInHeadset ? this.panel : null;
