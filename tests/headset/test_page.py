@@ -10,7 +10,7 @@ from helpers import emulated_wearer as worn
 from helpers.browser import Browser
 from helpers.headset_room import MAP, HeadsetRoom
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 def test_pairing_says_what_is_wrong_and_a_name_is_a_text(chromium: Browser, room: HeadsetRoom) -> None:
