@@ -106,17 +106,16 @@ def test_hands_place_a_cube_and_the_panel_commands(chromium: Browser, room: Head
     assert page.problems == []
 
 
-@pytest.mark.slow
-def test_a_wrong_mount_is_said(chromium: Browser, room: HeadsetRoom) -> None:
-    wrong = worn.T_body_viewer @ se3.exp(np.array([np.radians(6), 0, np.radians(6), 0, 0, 0]))
+def test_a_mount_that_is_two_degrees_wrong_is_said(chromium: Browser, room: HeadsetRoom) -> None:
+    wrong = worn.T_body_viewer @ se3.exp(np.array([np.radians(2), 0, 0, 0, 0, 0]))
     walk = worn.Walk(wrong)
     walk.walks, room.agents["ann"] = True, ("ar", walk)
     page = worn.wear(chromium, room.url, "ann")
     page.evaluate("walks = true")
-    page.wait("app.placement.isContradicted", 15)
+    page.wait("app.placement.isContradicted", 60)
+    worn.wait_until_said(page, "share calibrate headset")
 
 
-@pytest.mark.slow
 def test_script_time_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
     page = worn.wear(chromium, room.url, "ann")
     for k in range(16):
@@ -128,7 +127,6 @@ def test_script_time_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
     assert summary["p50_ms"] <= 2.0
 
 
-@pytest.mark.slow
 def test_memory_does_not_grow(chromium: Browser, room: HeadsetRoom) -> None:
     """In two minutes of walking and dragging; after collection."""
     walk = room.agents["ann"][1]
