@@ -19,8 +19,18 @@ from share.types import F64
 _WALK = np.repeat([np.radians(0.03), 0.003], 3)
 _TREMBLE = np.repeat([np.radians(0.05), 0.001], 3)  # of headset poses, rad and m
 _CORRELATION_S = 2.0  # how long errors of map poses last
+_USUAL_SIGMA_M, _USUAL_SIGMA_RAD = 0.01, 0.004  # of a pose that names none, of three axes together
+_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 0.005, 0.002  # an agent knows no better what its camera and IMU do
 _MAX_NIS = 40.0  # of a pair, 6 degrees of freedom, as if errors did not last: one in 10^6
 _MAX_REFUSED_S = 1.0  # of refused pairs in a row, after which they are right
+
+
+def pose_cov(sigma_m: float | None, sigma_rad: float | None) -> F64:
+    """Return the covariance (6, 6) of a pose in the map by what its agent says, of three axes together.
+    None: it does not say."""
+    position = max(_USUAL_SIGMA_M if sigma_m is None else sigma_m, _LEAST_SIGMA_M)
+    rotation = max(_USUAL_SIGMA_RAD if sigma_rad is None else sigma_rad, _LEAST_SIGMA_RAD)
+    return np.diag(np.repeat([rotation**2 / 3, position**2 / 3], 3))
 
 
 class PairOutcome(Enum):

@@ -31,7 +31,7 @@ from share.net.transport import Address, parse_address
 from share.view.feed import ViewFeed
 from share.view.page_process import PageProcess, ServedPage, begin_process, end_process
 
-COLLECT_S = 1 / 60  # between messages to the process: poses are relayed at 30 Hz
+COLLECT_S = 1 / 60  # between messages to the process, as between those of poses to a page
 _NICENESS = 5  # below the edge, above the live room
 _TITLE = "headset page"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 MAX_REPLIES = 256  # answers that wait; a page with more does not read
-POSES_S = 1 / 30  # between messages with poses
+POSES_S = 1 / 60  # between messages with poses: agents of 30 Hz do not keep step with each other
 
 
 class Outbox:

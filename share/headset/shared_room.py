@@ -42,6 +42,7 @@ class _RoomAgent:
     motions: MotionEstimate = field(default_factory=MotionEstimate)
     motion: BodyMotion | None = None
     T_odom_body: F64 | None = None
+    sigmas: tuple[float | None, float | None] = (None, None)  # m and rad, of the newest pose in the map
     time_ns: int = 0
     state: str = ""
 
@@ -63,6 +64,7 @@ class _RoomAgent:
         self.time_ns = time_ns
         self.path.add_pose(event)
         self.path.forget_oldest_path()
+        self.sigmas = event.sigma_m, event.sigma_rad
         if not event.state.has_pose:
             self.motions.forget()
             self.T_odom_body = self.motion = None
@@ -84,12 +86,14 @@ class _RoomAgent:
             "quaternion": None,
             "velocity": None,
             "angular_velocity": None,
-            "sigma_m": None,  # agents do not send how certain a pose is
+            "sigma_m": None,
             "sigma_rad": None,
         }
         if place is None:
             return message
         message |= pose_fields(place[1])
+        for name, sigma in zip(("sigma_m", "sigma_rad"), self.sigmas, strict=True):
+            message[name] = None if sigma is None else round(sigma, 6)
         if self.motion is not None and self.T_odom_body is not None:
             R_map_odom = place[1][:3, :3] @ self.T_odom_body[:3, :3].T
             message["velocity"] = numbers(R_map_odom @ self.motion.velocity)

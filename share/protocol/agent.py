@@ -158,11 +158,12 @@ class AgentProtocol:
 
     def _publish_pose(self, frame: ev.FrameTracked, T_odom_body: F64) -> None:
         drift_cov = self._self_evaluation.drift.cov
-        self._effects.append(self._localisation.localise(frame, T_odom_body, drift_cov, self._now_ns))
+        localised = self._localisation.localise(frame, T_odom_body, drift_cov, self._now_ns)
+        self._effects.append(localised)
         if self.is_connected and self.makes_keyframes and self._pace.take_pose(self._now_ns):
             self._counts["poses"] += 1
             last, first = self._ledger.last_acknowledged, self._keyframe_chain.first_of_segment
-            self._send(pose_update(frame, T_odom_body, last, first, self._now_ns))
+            self._send(pose_update(localised, last, first, self._now_ns))
 
     def _on_keyframe_made(self, frame: ev.FrameTracked, candidate: OdometryKeyframe | None) -> None:
         """Make a keyframe of the candidate that came with `frame`, if the rate allows (else drop_rate)."""

@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 
 from share.geometry import se3
-from share.geometry.se3 import compose_cov, inverse, position_sigma
+from share.geometry.se3 import compose_cov, inverse, position_sigma, rotation_sigma
 from share.mapping.localisation_gate import AHEAD_M
 from share.metrics.local_error import WINDOW_S
 from share.protocol import agent_events as ev
@@ -169,15 +169,24 @@ class MapLocalisation:
 
 
 def pose_update(
-    frame: ev.FrameTracked, T_odom_body: F64, last: LedgerEntry | None, first_of_segment: int, now_ns: int
+    localised: ev.LocalisedPose, last: LedgerEntry | None, first_of_segment: int, now_ns: int
 ) -> m.PoseUpdate:
     """Return the pose relative to the last acknowledged keyframe `last`, or in odom if that is of an earlier
     segment. first_of_segment: lowest keyframe id of the present one."""
-    age_ms = min(max(0.0, (now_ns - frame.arrived_ns) / 1e6), m.MAX_POSE_AGE_MS)
-    if last is None or last.keyframe.id < first_of_segment:
-        return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body, age_ms)
-    T_keyframe_body = inverse(last.keyframe.T_odom_body) @ T_odom_body
-    return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body, age_ms)
+    age_ms = min(max(0.0, (now_ns - localised.arrived_ns) / 1e6), m.MAX_POSE_AGE_MS)
+    keyframe, T = -1, localised.T_odom_body
+    if last is not None and last.keyframe.id >= first_of_segment:
+        keyframe, T = last.keyframe.id, inverse(last.keyframe.T_odom_body) @ T
+    sigma_m, sigma_rad = _sigmas(localised.map_cov)
+    return m.PoseUpdate(localised.stamp_ns, localised.state, keyframe, T, age_ms, sigma_m, sigma_rad)
+
+
+def _sigmas(map_cov: F64 | None) -> tuple[float | None, float | None]:
+    """Return the sigmas of a pose in the map, m and rad; None where its covariance (6, 6) says nothing."""
+    if map_cov is None or not np.isfinite(map_cov).all():
+        return None, None
+    sigma_m, sigma_rad = (min(of(map_cov), m.MAX_SIGMA) for of in (position_sigma, rotation_sigma))
+    return sigma_m, sigma_rad
 
 
 class SelfEvaluation:

@@ -49,7 +49,7 @@ class KeyframeArrived:
 class PoseArrived:
     """A run's newest pose (4, 4), relative to its keyframe `keyframe`; -1: in odom. age_ms: as in
     `PoseUpdate`; None: unknown. stamp_ns: by the agent's clock. received_ns: when it came to the
-    edge, by this machine's monotonic clock."""
+    edge, by this machine's monotonic clock. sigma_m, sigma_rad: as in `PoseUpdate`."""
 
     run: str
     state: TrackState
@@ -58,6 +58,8 @@ class PoseArrived:
     age_ms: float | None = None
     stamp_ns: int = 0
     received_ns: int = 0
+    sigma_m: float | None = None
+    sigma_rad: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -193,6 +193,8 @@ class ViewFeed:
                     pose.age_ms,
                     pose.stamp_ns,
                     received_ns,
+                    pose.sigma_m,
+                    pose.sigma_rad,
                 )
 
     def _events(self, entry: object) -> Iterator[ev.RoomEvent]:

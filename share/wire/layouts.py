@@ -256,6 +256,8 @@ LAYOUTS: dict[type, MessageLayout] = {
         state=TrackState,
         keyframe=Int64,
         age_ms=float,
+        sigma_m=float | None,
+        sigma_rad=float | None,
     ),
     Keyframe: MessageLayout(
         3,

@@ -22,6 +22,7 @@ MAX_BUFFERED = 256  # ids in one Ack: keyframes buffered at the edge
 MAX_TEXT_LENGTH = 512  # characters of a text for a person
 MAX_REASON_LENGTH = 120  # characters of `Status.reason`
 MAX_POSE_AGE_MS = 1e9  # 11 days
+MAX_SIGMA = 1e6  # m or rad: as good as unknown
 MAX_IMAGE_SIDE = 8192  # px, of an image
 MAX_IMU_SAMPLES = 20_000  # in one frame
 MAX_DELAY_MS = 1e7  # three hours
@@ -51,6 +52,11 @@ def _check_age(name: str, ms: float) -> None:
         raise ValueError(f"{name}: {ms} is outside 0 .. {MAX_POSE_AGE_MS:g}")
 
 
+def _check_sigma(name: str, sigma: float | None) -> None:
+    if sigma is not None and not 0 <= sigma <= MAX_SIGMA:
+        raise ValueError(f"{name}: {sigma} is outside 0 .. {MAX_SIGMA:g}")
+
+
 # ---------------------------------------------------------------- up: agent -> edge
 
 
@@ -77,17 +83,22 @@ class Hello:
 @dataclass(frozen=True, eq=False)
 class PoseUpdate:
     """Sent for every frame: the body's pose (4, 4) relative to the sent keyframe `keyframe`, or in odom if
-    -1. age_ms: from the frame's arrival to this message."""
+    -1. age_ms: from the frame's arrival to this message. sigma_m, sigma_rad: of the pose in the map, of
+    three axes together; None: not in a map, or not known."""
 
     stamp_ns: int
     state: TrackState
     keyframe: int
     T_keyframe_body: F64
     age_ms: float = 0.0
+    sigma_m: float | None = None
+    sigma_rad: float | None = None
 
     def __post_init__(self) -> None:
         checked_stamp("stamp_ns", self.stamp_ns)
         _check_age("age_ms", self.age_ms)
+        for name in ("sigma_m", "sigma_rad"):
+            _check_sigma(name, getattr(self, name))
         checked_id("keyframe", self.keyframe, minimum=-1)
         object.__setattr__(self, "T_keyframe_body", checked_pose("T_keyframe_body", self.T_keyframe_body))
 

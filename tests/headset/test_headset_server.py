@@ -330,7 +330,7 @@ def test_a_hundred_connections_keep_no_wearer_out(fresh: HeadsetPage) -> None:
                 one.close()
 
 
-def test_poses_are_relayed_the_newest_at_thirty_hertz(fresh: HeadsetPage) -> None:
+def test_poses_are_relayed_the_newest_at_sixty_hertz(fresh: HeadsetPage) -> None:
     feed = fresh.feed
     key = KeyframeKey("tb-1", 0)
     feed.add_event(ev.RunArrived("tb-1", "tb", AgentKind.ROBOT, np.eye(4), (0.8, 0.6)))
@@ -345,7 +345,7 @@ def test_poses_are_relayed_the_newest_at_thirty_hertz(fresh: HeadsetPage) -> Non
             time.sleep(0.005)
         last = ann.wait("poses", lambda m: m["poses"][0]["position"] == [1.99, 0, 0])["poses"][0]
         came = [m for m in ann.seen if m["type"] == "poses"]
-        assert len(came) <= 1 + 31 * (time.monotonic() - began)
+        assert len(came) <= 1 + 61 * (time.monotonic() - began)
         assert (last["agent"], last["kind"], last["state"], last["map_id"]) == ("tb", "robot", "OK", MAP)
         assert last["t_ms"] == pytest.approx(now_ns / 1e6 - 2.0, abs=1.0)
         assert 0 < last["velocity"][0] <= 2.0

@@ -12,7 +12,7 @@ from helpers.browser import BrowserPage
 from helpers.headset_wearer import T_body_viewer, wearer
 
 from share.geometry import se3
-from share.headset.alignment import PosePair, SpaceAlignment
+from share.headset.alignment import PosePair, SpaceAlignment, pose_cov
 from share.headset.prediction import predict_pose
 from share.types import F64
 
@@ -141,6 +141,12 @@ def test_alignment_is_the_reference(modules: BrowserPage, seed: int) -> None:
     for name, scale in (("T", 1.0), ("cov", 1e-4), ("at", 1e-4)):
         values, wanted = (np.array([row[name] for row in rows]) for rows in (found, expected))
         assert np.abs(values - wanted).max() < 1e-8 * scale, name
+
+
+@pytest.mark.parametrize("sigmas", [(None, None), (0.03, None), (None, 0.01), (0.0, 0.0), (2.5, 0.7)])
+def test_how_certain_a_pose_is(modules: BrowserPage, sigmas: tuple[float | None, float | None]) -> None:
+    found = run(modules, "alignment", "[...m.poseCov(...sigmas)]", sigmas=sigmas)
+    assert np.allclose(found, pose_cov(*sigmas).ravel(), atol=1e-15)
 
 
 def test_history_interpolates(modules: BrowserPage, rng: np.random.Generator) -> None:

@@ -29,8 +29,11 @@ def test_two_wearers_share_a_marker(chromium: Browser, room: HeadsetRoom) -> Non
     assert marker["owner"] == "ann" and np.allclose(marker["position"], target[:3], atol=0.01)
     ben.wait(f"Math.abs([...app.room.objects.values()][0].T[12] - {marker['position'][0]}) < 1e-6")
     late = worn.lateness_ms(ann, ben)
+    frame_ms = max(worn.frame_ms(page) for page in (ann, ben))
     print(f"drawn by the other after {np.percentile(late, [50, 95]).round(1)} ms, {len(late)} places")
-    assert len(late) > 40 and np.median(late) < 60
+    assert len(late) > 20 and np.median(late) < 60 + 2 * max(frame_ms - 17, 0), (
+        frame_ms
+    )  # a busy machine's are longer
     assert ann.problems == ben.problems == []
 
 
@@ -45,9 +48,8 @@ def test_the_room_stays_where_it_is(chromium: Browser, room: HeadsetRoom) -> Non
     print(f"align: {1e3 * np.median(errors, 0)[0]:.1f} mm, {np.degrees(np.median(errors, 0)[1]):.2f} deg")
     assert np.median(errors, axis=0)[0] < 0.01 and np.degrees(np.median(errors, axis=0)[1]) < 0.2
     walk.walks = False
-    page.evaluate("walks = false")
-    page.app("app.interaction.arm('marker')")
-    worn.press(page, True)
+    worn.stand(page)
+    worn.place(page, "marker")
     before = page.wait("[...app.room.objects.values()].map((one) => [...one.T])[0]")
     page.evaluate("(space = { yaw: 1.0, x: 0.4, z: -0.3 }, headset.recenter())")
     page.wait("app.placement.mapId === null || app.commands.notice.text.includes('recentred')")
@@ -104,17 +106,16 @@ def test_hands_place_a_cube_and_the_panel_commands(chromium: Browser, room: Head
     assert page.problems == []
 
 
-@pytest.mark.slow
-def test_a_wrong_mount_is_said(chromium: Browser, room: HeadsetRoom) -> None:
-    wrong = worn.T_body_viewer @ se3.exp(np.array([np.radians(6), 0, np.radians(6), 0, 0, 0]))
+def test_a_mount_that_is_two_degrees_wrong_is_said(chromium: Browser, room: HeadsetRoom) -> None:
+    wrong = worn.T_body_viewer @ se3.exp(np.array([np.radians(2), 0, 0, 0, 0, 0]))
     walk = worn.Walk(wrong)
     walk.walks, room.agents["ann"] = True, ("ar", walk)
     page = worn.wear(chromium, room.url, "ann")
     page.evaluate("walks = true")
-    page.wait("app.placement.isContradicted", 15)
+    page.wait("app.placement.isContradicted", 60)
+    worn.wait_until_said(page, "share calibrate headset")
 
 
-@pytest.mark.slow
 def test_script_time_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
     page = worn.wear(chromium, room.url, "ann")
     for k in range(16):
@@ -126,15 +127,13 @@ def test_script_time_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
     assert summary["p50_ms"] <= 2.0
 
 
-@pytest.mark.slow
 def test_memory_does_not_grow(chromium: Browser, room: HeadsetRoom) -> None:
     """In two minutes of walking and dragging; after collection."""
     walk = room.agents["ann"][1]
     page = worn.wear(chromium, room.url, "ann")
     walk.walks = True
     page.evaluate("walks = true")
-    page.app("app.interaction.arm('marker')")
-    worn.press(page, True)
+    worn.place(page, "marker")
     page.evaluate(
         "(began = performance.now(), drags = () => {"
         " const s = Math.sin((performance.now() - began) / 1000);"

@@ -41,6 +41,16 @@ class Playing(SharedRoom):
         self.apply(ev.PoseArrived(run, state, keyframe, T, 5.0, stamp_ns, stamp_ns + 105 * MS))
 
 
+def test_a_pose_says_how_certain_it_is() -> None:
+    room = Playing()
+    for sigmas, said in (((0.0123456789, 0.004), (0.012346, 0.004)), ((None, None), (None, None))):
+        room.apply(ev.PoseArrived("ann-1", TrackState.OK, 0, EYE, 5.0, MS, 2 * MS, *sigmas))
+        (told,) = room.take_poses()
+        assert (told["sigma_m"], told["sigma_rad"]) == said
+    room.apply(ev.PoseArrived("ann-1", TrackState.LOST, -1, EYE, 5.0, 2 * MS, 3 * MS, 0.1, 0.1))
+    assert room.take_poses()[0]["sigma_m"] is None  # there is no pose
+
+
 def test_a_pose_is_in_the_map_with_its_time_and_motion() -> None:
     room = Playing()
     room.apply(ev.CorrectionArrived("ann-1", "A", at(10, 0, np.pi / 2), 0))

@@ -44,6 +44,16 @@ _EMULATED = """
 })();
 """
 
+# The middle of an element; null as long as it is not there, disabled, hidden or covered.
+_PUSHABLE = """(selector) => {
+    const one = document.querySelector(selector);
+    if (!one || one.disabled) return null;
+    one.scrollIntoView({ block: "center" });
+    const box = one.getBoundingClientRect();
+    const at = [box.x + box.width / 2, box.y + box.height / 2];
+    return document.elementFromPoint(...at) === one ? at : null;
+}"""
+
 
 class BrowserError(Exception):
     """A script of the page failed."""
@@ -106,13 +116,13 @@ class BrowserPage:
         self.call("Emulation.setDeviceMetricsOverride", **size, mobile=width < height)
 
     def click(self, selector: str) -> None:
-        box = self.evaluate(
-            "((one) => { one.scrollIntoView({ block: 'center' }); const box = one.getBoundingClientRect();"
-            " return [box.x + box.width / 2, box.y + box.height / 2]; })"
-            f"(document.querySelector({selector!r}))"
-        )
-        self.mouse("mousePressed", *box)
-        self.mouse("mouseReleased", *box)
+        """Push an element in its middle, once it can be pushed there."""
+        end = time.monotonic() + _CALL_S
+        while (at := self.evaluate(f"({_PUSHABLE})({selector!r})")) is None:
+            assert time.monotonic() < end, f"{selector} cannot be pushed; {self.problems}"
+            time.sleep(0.03)
+        self.mouse("mousePressed", *at)
+        self.mouse("mouseReleased", *at)
 
     def mouse(self, kind: str, x: float, y: float) -> None:
         button = "none" if kind == "mouseMoved" else "left"

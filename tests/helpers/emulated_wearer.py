@@ -99,11 +99,43 @@ def wear(
     page = browser.page(url, *size, emulator())
     page.evaluate(f"(() => {{{_SCRIPT}}})()")
     pair(page, name, name, code)
+    enter(page)
+    return page
+
+
+def enter(page: BrowserPage) -> None:
+    """Enter AR once the page is connected."""
     page.wait("app.connection.isConnected && app.connection.clock.isKnown")
-    page.wait("!document.getElementById('enter').hidden")
     page.click("#enter")
     page.wait("app.isInHeadset && app.frames > 20")
-    return page
+
+
+def open_again(page: BrowserPage, url: str) -> None:
+    """Load the page again, in the same headset."""
+    page.open(url)
+    page.evaluate(f"(() => {{{_SCRIPT}}})()")
+    enter(page)
+
+
+def walk_aligned(page: BrowserPage) -> None:
+    """Walk about until what is drawn stays in its place."""
+    page.evaluate("walks = true")
+    page.wait("app.place.mapId !== null && app.alignmentMm !== null")
+    end = time.monotonic() + 60.0  # on a busy machine the page learns the server's clock slowly
+    while (error_m := np.median([drawn_error(page)[0] for _ in range(20)])) > 0.01:
+        assert time.monotonic() < end, error_m
+
+
+def wait_until_said(page: BrowserPage, text: str, seconds: float = 60.0) -> None:
+    """Wait until the panel says so."""
+    said = "import('/hud.js').then(({ stateLines }) => import('/main.js').then(({ app }) => stateLines(app)))"
+    end = time.monotonic() + seconds
+    while True:
+        lines = [line for line, _ in page.evaluate(said)]
+        if any(text in line for line in lines):
+            return
+        assert time.monotonic() < end, lines
+        time.sleep(0.05)
 
 
 def drawn_error(page: BrowserPage, room_space: F64 | None = None) -> tuple[float, float]:
@@ -132,12 +164,38 @@ def wait_frames(page: BrowserPage, count: int) -> None:
     page.wait(f"app.frames >= {page.app('app.frames') + count}")
 
 
+def aim(page: BrowserPage, button: str) -> None:
+    """Point at a button of the panel, which follows who walks."""
+    for _ in range(100):
+        page.app(f"(aims = {{ ...aims, at: unspaced(app.panel.centreOf({button!r})) }}, 0)")
+        wait_frames(page, 2)
+        if page.app("app.panel.hovered?.name") == button:
+            return
+    raise AssertionError(f"the button {button} cannot be pushed")
+
+
 def push(page: BrowserPage, button: str) -> None:
     """Point at a button of the panel and press it."""
-    page.app(f"(aims = {{ ...aims, at: unspaced(app.panel.centreOf({button!r})) }}, 0)")
-    wait_frames(page, 3)
+    aim(page, button)
     press(page, True)
     press(page, False)
+
+
+def stand(page: BrowserPage) -> None:
+    """End the walk, with the panel before the wearer, where no ray to the floor meets it."""
+    page.app("(walks = false, app.panel.forget(), 0)")
+    wait_frames(page, 3)
+
+
+def place(page: BrowserPage, what: str) -> None:
+    """Pull the trigger until a cube or marker is there: a panel that followed may be in the way."""
+    page.app(f"(app.interaction.armed = {what!r}, 0)")
+    for _ in range(100):
+        press(page, True)
+        if page.app("app.interaction.armed === null"):
+            return
+        press(page, False)
+    raise AssertionError(f"no {what} was placed")
 
 
 def drag_marker(page: BrowserPage, seconds: float) -> None:
@@ -145,7 +203,7 @@ def drag_marker(page: BrowserPage, seconds: float) -> None:
     push(page, "marker")
     page.evaluate("aims = { ...aims, at: [0.6, 0, -1.4] }, 0")
     wait_frames(page, 3)
-    press(page, True)
+    place(page, "marker")
     page.evaluate(
         "(began = performance.now(), drags = () => {"
         f" const s = Math.min((performance.now() - began) / {1000 * seconds}, 1);"
@@ -159,8 +217,10 @@ def drag_marker(page: BrowserPage, seconds: float) -> None:
 
 # Notes when a marker is drawn where, ms of the wall clock.
 SEEN = """(seen = [], () => {
+    frameTimes = [];
     const note = () => {
         requestAnimationFrame(note);
+        frameTimes.push(performance.now());
         const one = [...app.room.objects.values()].find((one) => one.kind === "marker");
         if (one) seen.push([performance.timeOrigin + performance.now(), one.shown[12], one.shown[13]]);
     };
@@ -175,3 +235,35 @@ def lateness_ms(first: BrowserPage, second: BrowserPage) -> F64:
         for at_ms, x, y in page.evaluate("seen"):
             times.setdefault((round(x, 4), round(y, 4)), at_ms)
     return np.array([at_ms - drawn[place] for place, at_ms in seen.items() if place in drawn])
+
+
+def frame_ms(page: BrowserPage) -> float:
+    """Return the time between two frames of a page, median, ms, by `SEEN`."""
+    return float(np.median(np.diff(page.evaluate("frameTimes"))))
+
+
+# Notes where each object is drawn in the room, by the headset's own space, which `space` says the shift of.
+WATCH = """(async () => {
+    const { inverse, identity, transformPoint } = await import("/math.js");
+    const { app } = await import("/main.js");
+    watched = {};
+    const note = () => {
+        requestAnimationFrame(note);
+        if (app.place.mapId === null) return;
+        const T_local_map = inverse(identity(), app.place.T_map_local);
+        for (const [id, one] of app.room.objects) {
+            const p = [...transformPoint([0, 0, 0], T_local_map, one.shown.subarray(12, 15))];
+            (watched[id] ??= []).push(unspaced(p));
+        }
+    };
+    requestAnimationFrame(note);
+})()"""
+
+
+def moved_m(page: BrowserPage, object_id: int) -> tuple[float, float]:
+    """Return how far at most an object was drawn from where it was first, and how far it moved between two
+    frames, by `WATCH`; then begin anew."""
+    drawn = np.array(page.evaluate(f"watched[{object_id}]"))
+    page.evaluate("(watched = {}, 0)")
+    steps = np.linalg.norm(np.diff(drawn, axis=0), axis=1)
+    return float(np.linalg.norm(drawn - np.median(drawn[:5], axis=0), axis=1).max()), float(steps.max())

@@ -186,7 +186,15 @@ of_clients = st.one_of(
 messages = st.one_of(
     of_clients,
     st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, rigs(), st.booleans()),
-    st.builds(m.PoseUpdate, stamps, st.sampled_from(TrackState), ids_or_none, poses()),
+    st.builds(
+        m.PoseUpdate,
+        stamps,
+        st.sampled_from(TrackState),
+        ids_or_none,
+        poses(),
+        st.floats(0, m.MAX_POSE_AGE_MS),
+        *[st.none() | st.floats(0, m.MAX_SIGMA)] * 2,
+    ),
     keyframes(),
     st.builds(m.Evaluation, ids_or_none, late, st.none() | late, late, late, late, late),
     st.builds(

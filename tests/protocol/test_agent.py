@@ -295,6 +295,19 @@ def test_poses_are_relative_to_the_last_acknowledged_keyframe() -> None:
         assert [p.keyframe for p in only(m.PoseUpdate, effects, messages=True)] == [-1]
 
 
+def test_a_pose_in_the_map_says_how_certain_it_is() -> None:
+    """By the correction, turned and moved to the body, and odometry since."""
+    agent = welcomed()
+    [before] = only(m.PoseUpdate, handle(agent, tracked(0, pose(1), candidate=True), 0), messages=True)
+    assert before.sigma_m is None and before.sigma_rad is None
+    tell(agent, m.Ack(1), 50 * MS)
+    tell(agent, correction(pose(0), 1, answers=0), 60 * MS)
+    effects = handle(agent, tracked(1, pose(2)), 100 * MS)
+    [sent], [known] = only(m.PoseUpdate, effects, messages=True), only(ev.LocalisedPose, effects)
+    assert sent.sigma_m == pytest.approx(np.sqrt(np.trace(known.map_cov[3:, 3:]))) and sent.sigma_m > 0
+    assert sent.sigma_rad == pytest.approx(np.sqrt(np.trace(known.map_cov[:3, :3]))) and sent.sigma_rad > 0
+
+
 def test_keyframes_are_numbered_sent_and_evaluated() -> None:
     agent = welcomed()
     [ping] = only(m.Ping, handle(agent, ev.AgentTick(), 500 * MS), messages=True)

@@ -70,7 +70,7 @@ def frame(stereo: bool) -> Frame:
 
 EXAMPLES: list[m.Message] = [
     m.Hello("ann", AgentKind.AR, 2**62, STEREO),
-    m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31 - 1, POSE, 6.25),
+    m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31 - 1, POSE, 6.25, 0.012, 0.004),
     keyframe(5),
     keyframe_with_image(3, 40),
     m.Evaluation(3, 12.5, None),
@@ -219,7 +219,7 @@ def header(version: object = V, code: object = 5, scalars: object = (1, 2), arra
 
 T_FRAMES = [b"\0" * 128]
 OURS = bytes([0x94, V])  # how a header begins
-POSE_SCALARS = (1, "OK", -1, 3.0)
+POSE_SCALARS = (1, "OK", -1, 3.0, 0.01, None)
 
 
 def bad_keyframe(
@@ -252,8 +252,15 @@ BAD = {
     "T_keyframe_body: <f8 of shape (2, 8)": [header(V, 2, POSE_SCALARS, [("<f8", (2, 8))]), *T_FRAMES],
     "T_keyframe_body: 127 bytes": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\0" * 127],
     "is not a rigid transform": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
+    "sigma_rad: -0.1 is outside 0 .. 1e+06": [
+        header(V, 2, (*POSE_SCALARS[:5], -0.1), [("<f8", (4, 4))]),
+        np.eye(4).tobytes(),
+    ],
     "not finite": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
-    "Invalid enum value 'LOSTER'": [header(V, 2, (1, "LOSTER", -1, 3.0), [("<f8", (4, 4))]), *T_FRAMES],
+    "Invalid enum value 'LOSTER'": [
+        header(V, 2, (1, "LOSTER", *POSE_SCALARS[2:]), [("<f8", (4, 4))]),
+        *T_FRAMES,
+    ],
     "predecessor: 9": bad_keyframe((7, -1, 0, 9, 0.0)),
     "up_sigma: -0.1 is outside 0 .. 1e+06": bad_keyframe((7, -1, 0, 6, -0.1)),
     "view.uv: <f4 of shape (2001, 2)": bad_keyframe(at=4, entry=("<f4", (2001, 2)), data=b"\0" * 16008),
@@ -320,7 +327,7 @@ def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:
 )
 def test_text_of_a_peer_is_quoted_and_cut(state: str, said: str) -> None:
     """An unclosed quote would let the text continue as the edge's own."""
-    frames = [header(V, 2, [0, state, -1, 3.0], [("<f8", (4, 4))]), np.eye(4).tobytes()]
+    frames = [header(V, 2, [0, state, *POSE_SCALARS[2:]], [("<f8", (4, 4))]), np.eye(4).tobytes()]
     with pytest.raises(WireError) as refused:
         codec.decode(frames)
     assert str(refused.value) == said

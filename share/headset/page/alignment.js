@@ -8,6 +8,8 @@ const squared = (rotation, translation) => [0, 1, 2, 3, 4, 5].map((k) => (k < 3 
 const WALK = squared(radians(0.03), 0.003);  // random walk at the wearer, rad and m in the root of a second, squared
 const TREMBLE = squared(radians(0.05), 0.001);  // of headset poses
 const CORRELATION_S = 2.0;  // how long errors of map poses last
+const USUAL_SIGMA = { rad: 0.004, m: 0.01 };  // of a pose that names none, of three axes together
+const LEAST_SIGMA = { rad: 0.002, m: 0.005 };  // an agent knows no better than this what its camera and IMU do
 const MAX_NIS = 40.0;  // of a pair, 6 degrees of freedom, as if errors did not last
 const MAX_REFUSED_S = 1.0;  // of refused pairs in a row, after which they are right
 
@@ -25,6 +27,17 @@ const plusDiagonal = (A, diagonal, scale = 1) => {
     for (let i = 0; i < 6; i++) out[7 * i] += diagonal[i] * scale;
     return out;
 };
+
+// The covariance (6, 6) of a pose in the map by what its agent says, of three axes together; null: it does not say.
+export function poseCov(sigmaM, sigmaRad) {
+    const sigmas = [
+        Math.max(sigmaRad ?? USUAL_SIGMA.rad, LEAST_SIGMA.rad),
+        Math.max(sigmaM ?? USUAL_SIGMA.m, LEAST_SIGMA.m),
+    ];
+    const cov = new Float64Array(36);
+    for (let i = 0; i < 6; i++) cov[7 * i] = sigmas[i < 3 ? 0 : 1] ** 2 / 3;
+    return cov;
+}
 
 // T_map_local with cov (6, 6), perturbed on the left in the map; null before a pair.
 export class SpaceAlignment {

@@ -32,7 +32,7 @@ export class Commands {
                 run: () => this.#nextRobot(),
                 isShown: () => this.#robots().length > 1,
             }),
-            button("mode", () => (app.placement.mode === "align" ? "Align" : "Follow"), {
+            button("mode", () => `Mode: ${app.placement.mode}`, {
                 run: () => app.placement.setMode(app.placement.mode === "align" ? "follow" : "align"),
                 isShown: inHeadset,
             }),

@@ -16,13 +16,13 @@ export function stateLines(app) {
     if (ms !== null) {
         const over = Math.round((100 * ms.over_20ms) / ms.frames);
         const [p50, p95] = [ms.p50_ms, ms.p95_ms].map((value) => value.toFixed(0));
-        lines.push([`pose to frame ${p50} ms, 95 % ${p95} ms; ${over} % over 20 ms`, DIM]);
+        lines.push([`pose to frame ${p50}\u00a0ms (95\u00a0%: ${p95}), ${over}\u00a0% over 20\u00a0ms`, DIM]);
     }
     const robot = [...room.commands.values()].at(-1) ?? [...room.robots.values()].at(-1);
     if (robot) lines.push([`${robot.robot}: ${room.words(robot.robot)}`, PLAIN]);
     const { text, sinceMs } = commands.notice;
+    if (placement.isContradicted) lines.push(["the mount contradicts itself: share calibrate headset", BAD]);
     if (text && performance.now() - sinceMs < NOTICE_MS) lines.push([text, PLAIN]);
-    else if (placement.isContradicted) lines.push(["the mount contradicts itself: share calibrate headset", BAD]);
     return lines;
 }
 

@@ -1,4 +1,5 @@
 // The page: it joins the parts, and draws frames, flat or in the headset.
+import { poseCov } from "./alignment.js";
 import { Commands } from "./commands.js";
 import { Connection } from "./connection.js";
 import { T_xr_map } from "./conventions.js";
@@ -11,14 +12,13 @@ import { Placement } from "./placement.js";
 import { Preview } from "./preview.js";
 import { Renderer } from "./renderer.js";
 import { Room } from "./room.js";
-import { Scene } from "./scene.js";
+import { LABEL_SHARE, Scene } from "./scene.js";
 
 const MEASURED_MS = 2000;
 const HUD_MS = 200;
 const MAX_AGE_MS = 10000;  // of a pose; beyond, nothing comes: not a latency
+const LABEL_PX = 25;  // on flat screens
 const STOP_BUTTON = 5;  // B and Y of xr-standard gamepads
-const USUAL_SIGMA_M = 0.01;  // of a pose that names none
-const USUAL_SIGMA_RAD = 0.004;
 
 class App {
     wearer = "";
@@ -38,7 +38,7 @@ class App {
     #viewProjection = identity();
     #T_view_map = identity();
     #eye = new Float64Array(3);
-    #frame = { mapId: null, floorZ: 0, eye: null, T_map_camera: null, pointers: [], hovered: null, panel: null };
+    #frame = { mapId: null, floorZ: 0, eye: null, labelShare: LABEL_SHARE };
 
     constructor(canvas) {
         this.canvas = canvas;
@@ -131,12 +131,9 @@ class App {
     #onOwnPose(pose) {
         const timeMs = this.connection.clock.toPage(pose.t_ms);
         if (timeMs === null || pose.map_id === null) return;
-        const cov = new Float64Array(36);
-        const sigmas = [pose.sigma_rad ?? USUAL_SIGMA_RAD, pose.sigma_m ?? USUAL_SIGMA_M];  // of three axes together
-        for (let i = 0; i < 6; i++) cov[7 * i] = sigmas[i < 3 ? 0 : 1] ** 2 / 3;
         this.placement.addPose({
             timeMs,
-            cov,
+            cov: poseCov(pose.sigma_m, pose.sigma_rad),
             mapId: pose.map_id,
             T_map_body: Float64Array.from(this.room.agents.get(pose.agent).T),
             velocity: pose.velocity,
@@ -197,6 +194,7 @@ class App {
         frame.floorZ = this.place.floorZ;
         frame.eye = eye;
         frame.T_map_camera = this.isInHeadset ? null : this.preview.T_map_camera;
+        frame.labelShare = this.isInHeadset ? LABEL_SHARE : this.preview.shareOf(LABEL_PX);
         frame.pointers = pointers;
         frame.hovered = this.interaction.hovered;
         frame.panel = this.isInHeadset ? this.panel : null;

@@ -3,13 +3,14 @@
 import { identity, inverse, multiply, transformPoint } from "./math.js";
 
 const [WIDTH_M, HEIGHT_M] = [0.48, 0.36];
-const [WIDTH, HEIGHT] = [1024, 768];
+const [WIDTH, HEIGHT] = [1024, 768];  // in which it is laid out
+const SCALE = 0.75;  // to pixels: as many as a headset has where it hangs
 const COLUMNS = 4;
 const [BUTTON_TOP, BUTTON_HEIGHT, GAP, MARGIN] = [416, 96, 14, 32];
 const [AHEAD_M, BELOW_M] = [0.8, 0.36];
 const MAX_TURNED = 0.75;  // rad, and
 const MAX_AWAY_M = 0.5;  // beyond which it comes along
-const REDRAWN_MS = 250;
+const REDRAWN_MS = 500;  // a drawing costs ten frames
 
 export class Panel {
     T_local_panel = identity();
@@ -28,8 +29,8 @@ export class Panel {
     constructor(renderer, buttons) {
         this.renderer = renderer;
         this.buttons = buttons;
-        this.#canvas.width = WIDTH;
-        this.#canvas.height = HEIGHT;
+        this.#canvas.width = SCALE * WIDTH;
+        this.#canvas.height = SCALE * HEIGHT;
     }
 
     // Of a new session, or of a space that was reset.
@@ -109,6 +110,7 @@ export class Panel {
         if (key === this.#shown) return;
         this.#shown = key;
         const context = this.#canvas.getContext("2d");
+        context.setTransform(SCALE, 0, 0, SCALE, 0, 0);
         context.clearRect(0, 0, WIDTH, HEIGHT);
         box(context, 0, 0, WIDTH, HEIGHT, 40, "rgba(11, 16, 23, 0.86)");
         context.textBaseline = "middle";

@@ -66,6 +66,11 @@ export class Preview {
         this.pointers = [...this.#fingers.values()].map(({ pointer }) => pointer);
     }
 
+    // The part of its distance that so many px of the screen show.
+    shareOf(px) {
+        return (2 * px) / (this.canvas.clientHeight * this.projection[5]);
+    }
+
     #point(pointer, left, top) {
         const { clientWidth, clientHeight } = this.canvas;
         const x = (2 * left) / clientWidth - 1;

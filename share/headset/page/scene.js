@@ -7,8 +7,8 @@ import { STANDING } from "./room.js";
 const STILL = [0, 0, 0];
 const WHITE = [1, 1, 1];
 const POINTS = [0.62, 0.74, 0.85];
-const LABEL_SHARE = 0.027;  // of the distance; within
-const [LEAST_LABEL_M, MOST_LABEL_M] = [0.04, 0.3];
+export const LABEL_SHARE = 0.027;  // of the distance, in a headset; within
+const [LEAST_LABEL_M, MOST_LABEL_M] = [0.04, 0.4];
 const OWNER = 0.75;  // of an object, in that size
 
 export class Scene {
@@ -50,7 +50,7 @@ export class Scene {
         }
     }
 
-    // frame: {mapId, floorZ, eye, T_map_camera, pointers, hovered, panel, isFlat, hidesOwn}; eye in the map; texts are
+    // frame: {mapId, floorZ, eye, T_map_camera, labelShare, pointers, hovered, panel, isFlat, hidesOwn}; eye in the map; texts are
     // level with a camera, or turned to the eye where it is null.
     draw(frame) {
         const { renderer, room } = this;
@@ -64,9 +64,9 @@ export class Scene {
                 renderer.drawPoints(this.#points, identityModel, POINTS, 0.99);
             }
         }
+        if (frame.mapId !== null) this.#drawLabels(frame);
         if (frame.panel?.texture) renderer.drawPicture(frame.panel.texture, frame.panel.model, 1, true);
         for (const pointer of frame.pointers) if (pointer.T_map_pointer !== null) this.#drawPointer(pointer, frame);
-        if (frame.mapId !== null) this.#drawLabels(frame);
     }
 
     #drawGrid({ floorZ, eye }) {
@@ -136,10 +136,10 @@ export class Scene {
     }
 
     // row: 0, or above that.
-    #drawLabel(text, x, y, z, { eye, T_map_camera }, size, row) {
+    #drawLabel(text, x, y, z, { eye, T_map_camera, labelShare }, size, row) {
         const { texture, aspect } = this.labels.of(text);
         const distance = Math.hypot(x - eye[0], y - eye[1], z - eye[2]);
-        const height = size * Math.min(Math.max(LABEL_SHARE * distance, LEAST_LABEL_M), MOST_LABEL_M);
+        const height = size * Math.min(Math.max(labelShare * distance, LEAST_LABEL_M), MOST_LABEL_M);
         const at = [x, y, z + (row + 0.5) * 1.15 * height];
         if (T_map_camera === null) this.#faceEye(at, height * aspect, height, eye);
         else this.#levelWith(T_map_camera, at, height * aspect, height);
