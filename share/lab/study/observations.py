@@ -46,6 +46,10 @@ class Observations:
         choices = {kind: tuple(names.get(one, one) for one in ones) for kind, ones in self.choices.items()}
         return replace(self, conditions=tuple(names[one] for one in self.conditions), choices=choices)
 
+    def with_note(self, note: str) -> Observations:
+        """Return the table with one more note."""
+        return replace(self, notes=(*self.notes, note))
+
 
 def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
     """Read the trials and answers of a study's folder. Raises DataError that names file and line."""
@@ -74,13 +78,15 @@ def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
 def _broken_note(records: Mapping[tuple[str, int], Any]) -> Iterable[str]:
     broken = [f"{name} place {place}" for (name, place), one in records.items() if not one.is_complete]
     if broken:
-        yield f"{len(broken)} trials were begun and not carried through; their goals are left out: {', '.join(broken)}"
+        names = ", ".join(broken)
+        yield f"{len(broken)} trials were begun and not carried through; their goals are left out: {names}"
 
 
 def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable[str]:
     if "map" in judges:
         yield (
-            "reachability is judged by the map itself (no motion capture), which favours policies under which "
+            "reachability is judged by the map itself (no motion capture), which favours policies under "
+            "which "
             "headset and robot drift together"
         )
     if statuses:
@@ -89,9 +95,7 @@ def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable
         )
 
 
-def _read_answers(
-    path: Path, plan: StudyPlan
-) -> tuple[dict[str, F64], dict[str, tuple[str, ...]]]:
+def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str, tuple[str, ...]]]:
     """Read answers after trials (P, C) by question, and most and least preferred conditions."""
     people = {one.name: k for k, one in enumerate(plan.participants)}
     letters = {letter: k for k, letter in enumerate(plan.letters)}
@@ -104,7 +108,13 @@ def _read_answers(
             if person not in people:
                 raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
             if "answers" in row:
-                _put_answers(table, row, plan, (people[person], letters[_known_letter(row["condition"], letters, where)]), where)
+                _put_answers(
+                    table,
+                    row,
+                    plan,
+                    (people[person], letters[_known_letter(row["condition"], letters, where)]),
+                    where,
+                )
             for kind in _CHOICES:
                 if kind in row:
                     if choices[kind][people[person]]:
@@ -135,9 +145,7 @@ def _put_answers(
                 f"{where}: {name}: {value!s:.40} is not a whole number from {asked.least} to {asked.greatest}"
             )
         if not math.isnan(table[name][cell]):
-            raise DataError(
-                f"{where}: {row['participant']} has answered {name} of {row['condition']} before"
-            )
+            raise DataError(f"{where}: {row['participant']} has answered {name} of {row['condition']} before")
         table[name][cell] = value
 
 
@@ -150,7 +158,8 @@ def read_table(path: Path, ranges: Ranges, choices_file: Path | None) -> Observa
     head = [name.strip() for name in lines[0][1]]
     if tuple(head[:3]) != _HEAD or len(head) < 4 or len(set(head)) < len(head):
         raise DataError(
-            f"{path}: its first line must be participant,condition,place and a name for each measure, each once"
+            f"{path}: its first line must be participant,condition,place and a name for each measure, each "
+            f"once"
         )
     for name in ranges:
         if name not in head[3:]:
@@ -239,7 +248,9 @@ def _number(cell: str, name: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) < 1e9:
-        raise DataError(f"{where}: {name}: '{cell:.40}' is not a number; leave the cell empty if it is missing")
+        raise DataError(
+            f"{where}: {name}: '{cell:.40}' is not a number; leave the cell empty if it is missing"
+        )
     return value
 
 
@@ -253,7 +264,13 @@ def _read_choices(path: Path, people: Sequence[str], conditions: Sequence[str]) 
         where = f"{path}, line {number}"
         person, *named = (cell.strip() for cell in cells)
         if person not in people or person in chosen or len(named) != 2:
-            reason = "comes twice" if person in chosen else "has no trial" if len(named) == 2 else "needs two more cells"
+            reason = (
+                "comes twice"
+                if person in chosen
+                else "has no trial"
+                if len(named) == 2
+                else "needs two more cells"
+            )
             raise DataError(f"{where}: participant {person:.40} {reason}")
         for one in named:
             if one and one not in conditions:

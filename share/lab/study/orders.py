@@ -92,7 +92,8 @@ class Balance:
         return len(set(self.places.ravel().tolist())) == 1 == len(set(self._pairs()))
 
     def _pairs(self) -> list[int]:
-        return self.successions[~np.eye(len(self.places), dtype=bool)].tolist()
+        k = len(self.places)
+        return [int(self.successions[i, j]) for i in range(k) for j in range(k) if i != j]
 
     def lines(self, names: list[str]) -> list[str]:
         """Say what is balanced and what exactly is not, conditions by their names."""

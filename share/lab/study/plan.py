@@ -29,7 +29,7 @@ from share.types import F64
 PLAN, KEY, UNBLINDED, TRIALS, ANSWERS = "plan.json", "key.json", "unblinded.json", "trials", "answers.jsonl"
 PAPER_POLICIES = ("share", "covins-g", "linear", "equal")
 MAX_PARTICIPANTS = 1000
-_PLAN_SCHEMA, _KEY_SCHEMA = "share study plan 1", "share study key 1"
+_PLAN_SCHEMA, _KEY_SCHEMA, _UNBLINDED_SCHEMA = "study plan 1", "study key 1", "study unblinded 1"
 _LETTERS = "ABCDEFGH"
 
 
@@ -65,7 +65,8 @@ QUESTIONS = (
 
 @dataclass(frozen=True)
 class SuccessRule:
-    """A goal is reached if the robot stands within `distance_m` of the cube within `timeout_s` of the call."""
+    """A goal is reached if the robot stands within `distance_m` of the cube within `timeout_s` of the
+    call."""
 
     distance_m: float = 0.5
     timeout_s: float = 30.0
@@ -181,17 +182,13 @@ def draw_plan(wishes: PlanWishes, seed: int, salt: str) -> tuple[StudyPlan, Stud
     people = tuple(
         Participant(
             f"p{number:0{digits}d}",
-            tuple(
-                PlannedTrial(letters[k], tuple((rng.permutation(spot_count) + 1).tolist())) for k in order
-            ),
+            tuple(PlannedTrial(letters[k], tuple((rng.permutation(spot_count) + 1).tolist())) for k in order),
         )
         for number, order in enumerate(orders, 1)
     )
     spots, path = (tuple((x, y) for x, y in points.tolist()) for points in (wishes.spots, wishes.path))
     sealed = hashlib.sha256(key.text().encode()).hexdigest()
-    plan = StudyPlan(
-        letters, sealed, spots, path, people, success=wishes.success, questions=wishes.questions
-    )
+    plan = StudyPlan(letters, sealed, spots, path, people, success=wishes.success, questions=wishes.questions)
     return plan, key
 
 
@@ -261,3 +258,32 @@ def renamed(letters: Sequence[str], policies: Mapping[str, str], where: str) -> 
     if missing:
         raise ConfigError(f"{where}: has no policy of {', '.join(missing)}; it has {', '.join(policies)}")
     return {letter: policies[letter] for letter in letters}
+
+
+@dataclass(frozen=True)
+class Unblinding:
+    """The policies behind the letters, and how much of the study was done when they were told."""
+
+    policies: dict[str, str]
+    key_sha256: str
+    when: str
+    done: int
+    planned: int
+    early: bool
+
+
+def unblinding_text(unblinding: Unblinding) -> str:
+    """Return the content of its file."""
+    return json.dumps({"schema": _UNBLINDED_SCHEMA, **dataclasses.asdict(unblinding)}, indent=1) + "\n"
+
+
+def read_unblinding(study: Path, plan: StudyPlan) -> Unblinding | None:
+    """Return what `share study unblind` wrote to a study's folder; None while it is blind."""
+    path = study / UNBLINDED
+    if not path.exists():
+        return None
+    data = _without_schema(read_json(path), _UNBLINDED_SCHEMA, path)
+    unblinding = from_mapping(Unblinding, data, str(path))
+    if unblinding.key_sha256 != plan.key_sha256:
+        raise ConfigError(f"{path}: is of another plan; remove it, and run `share study unblind` again")
+    return unblinding

@@ -55,8 +55,8 @@ def friedman_power(values: F64, participants: int) -> float:
 
 @dataclass(frozen=True)
 class NextStudy:
-    """Power by number of participants. needed: participants for 80 % by ANOVA; none where over 500. needed_at_worst:
-    the same for the lower bound of the effect's 95 % interval."""
+    """Power by number of participants. needed: participants for 80 % by ANOVA; None where over 500.
+    needed_at_worst: the same for the lower bound of the effect's 95 % interval."""
 
     sizes: tuple[int, ...]
     anova: tuple[float, ...]

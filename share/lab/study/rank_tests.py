@@ -77,8 +77,8 @@ def _tie_terms(ranks: F64) -> F64:
 
 @dataclass(frozen=True)
 class WilcoxonTest:
-    """Two-sided signed-rank test. w: lesser sum of ranks. pairs: that differ, of all. rank_biserial: of these,
-    positive where the first is greater, with a bootstrap interval over participants."""
+    """Two-sided signed-rank test. w: lesser sum of ranks. pairs: that differ, of all. rank_biserial: of
+    these, positive where the first is greater, with a bootstrap interval over participants."""
 
     w: float
     p: float
@@ -135,7 +135,8 @@ def _rank_biserial(differences: F64) -> Interval:
         ranks = weights @ below.T + (weights @ alike.T + 1) / 2
         total = (weights * ranks * (size > 0)).sum(axis=1)
         signed = (weights * ranks * sign).sum(axis=1)
-        return np.divide(signed, total, out=np.full(len(total), math.nan), where=total > 0)
+        part: F64 = np.divide(signed, total, out=np.full(len(total), math.nan), where=total > 0)
+        return part
 
     return bootstrap(value, len(differences))
 
@@ -207,4 +208,5 @@ def _exact_choice_p(counts: Sequence[int]) -> float:
                 more[state] = more.get(state, 0) + number * math.comb(n - used, count)
         ways = more
     observed = sum(count**2 for count in counts)
-    return sum(ways[used, sq] for used, sq in ways if used == n and sq >= observed) / k**n
+    as_large = sum(number for (used, squares), number in ways.items() if used == n and squares >= observed)
+    return float(as_large / k**n)

@@ -33,8 +33,8 @@ class Sphericity:
 
 @dataclass(frozen=True)
 class RepeatedAnova:
-    """p_gg, p_hf: with degrees of freedom times the epsilon. partial_eta2: interval by the noncentral F, as if
-    spherical. generalised_eta2: interval by bootstrap over participants."""
+    """p_gg, p_hf: with degrees of freedom times the epsilon. partial_eta2: interval by the noncentral F, as
+    if spherical. generalised_eta2: interval by bootstrap over participants."""
 
     f: float
     df: int
@@ -127,7 +127,8 @@ def _generalised_eta2(values: F64, weights: F64) -> F64:
     grand = weights @ values.mean(axis=1) / n
     effect = n * ((weights @ values / n - grand[:, None]) ** 2).sum(axis=1)
     total = weights @ (values**2).sum(axis=1) - n * k * grand**2
-    return np.divide(effect, total, out=np.full(len(total), math.nan), where=total > 1e-12)
+    part: F64 = np.divide(effect, total, out=np.full(len(total), math.nan), where=total > 1e-12)
+    return part
 
 
 def _partial_eta2(f: float, df: int, df_error: int) -> Interval:
@@ -188,7 +189,9 @@ def order_effects(values: F64, places: I64) -> OrderEffects:
         "carry-over": _sum_coded(before, k),
     }
     centred = values - _column_means(np.where(known, values, math.nan))
-    slopes = [_slope(row[is_known], at[is_known]) for row, at, is_known in zip(centred, places, known, strict=True)]
+    slopes = [
+        _slope(row[is_known], at[is_known]) for row, at, is_known in zip(centred, places, known, strict=True)
+    ]
     return OrderEffects(
         _partial_f(y, blocks, "place"),
         _partial_f(y, blocks, "carry-over"),

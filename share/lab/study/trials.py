@@ -110,7 +110,9 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
             else:
                 raise DataError(f"{where}: event '{kind!s:.40}' is not known")
     if record.is_complete and len(record.goals) != len(plan.spots):
-        raise DataError(f"{path}: says that it is complete, with {len(record.goals)} of {len(plan.spots)} goals")
+        raise DataError(
+            f"{path}: says that it is complete, with {len(record.goals)} of {len(plan.spots)} goals"
+        )
     return record
 
 
