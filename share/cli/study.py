@@ -21,6 +21,7 @@ from share.errors import UsageError
 if TYPE_CHECKING:
     from share.lab.study.observations import Observations
     from share.lab.study.plan import StudyPlan, SuccessRule
+    from share.lab.study.study_analysis import StudyAnalysis
 
 _PAPER = ("share", "covins-g", "linear", "equal")
 
@@ -252,7 +253,7 @@ def analyze(
     from share.files.json_file import nan_to_none
     from share.files.writing import writable_dir
     from share.lab.study.study_analysis import analyse
-    from share.lab.study.study_report import FILES, coverage_lines, rule_line, summary_line, write_report
+    from share.lab.study.study_report import FILES, coverage_lines, rule_line, write_report
 
     if out is not None:
         writable_dir(out, *FILES)
@@ -268,29 +269,27 @@ def analyze(
         success = None if rule is None else asdict(rule)
         click.echo(json.dumps(nan_to_none({"success": success} | _plain(asdict(found)))))
         return
-    rules = [] if rule is None else [rule_line(rule)]
-    for line in [*coverage_lines(found), *rules]:
+    for line in [*coverage_lines(found), *([] if rule is None else [rule_line(rule)])]:
         click.echo(f"* {line}")
     _print_tables(found)
-    for measure in found.measures:
-        click.echo(summary_line(measure))
     if files:
         click.echo(f"report: {', '.join(map(str, files))}")
 
 
-def _print_tables(found: Any) -> None:
+def _print_tables(found: StudyAnalysis) -> None:
     from share.cli.terminal import aligned_table
-    from share.lab.study.study_report import (
-        choice_rows,
-        comparison_rows,
-        descriptive_rows,
-        order_rows,
-        pair_rows,
-    )
+    from share.lab.study.study_report import choice_rows, differing_rows, order_rows, overview_rows
 
-    for rows in (f(found) for f in (descriptive_rows, comparison_rows, pair_rows, order_rows, choice_rows)):
+    differing = differing_rows(found)
+    compared = sum(len(measure.pairs) for measure in found.measures)
+    for title, rows in (
+        ("means and tests", overview_rows(found)),
+        (f"pairs with Holm's p below 0.05: {len(differing) - 1} of {compared}", differing),
+        ("order and learning", order_rows(found)),
+        ("preferences", choice_rows(found)),
+    ):
         if len(rows) > 1:
-            click.echo(f"\n{aligned_table(rows)}")
+            click.echo(f"\n{title}\n{aligned_table(rows)}")
     click.echo()
 
 

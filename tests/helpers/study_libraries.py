@@ -27,7 +27,7 @@ def data_set(seed: int) -> dict[str, Any]:
     effect = rng.normal(0, rng.choice([0.0, 0.5, 1.5]), k)
     values = 6 + rng.normal(0, 1.5, (n, 1)) + effect + rng.normal(0, rng.uniform(0.5, 2), (n, k))
     if seed % 3 == 0:
-        values = values.round(3)
+        values = np.rint(1024 * values) / 1024  # differences are exact, so ties are ties to all
     else:
         values = np.rint(values).clip(1, 10) if seed % 3 == 1 else np.rint(values / 2).clip(0, 4)
     missing = rng.random((n, k)) < rng.choice([0.0, 0.02, 0.05])

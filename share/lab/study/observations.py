@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from share.config import POLICY_NAMES
 from share.errors import DataError
 from share.files.json_file import own_format_errors, read_json_lines
 from share.files.reading import MAX_REPORT_BYTES, read_errors, read_text
@@ -42,9 +43,16 @@ class Observations:
     done: int = 0
 
     def named(self, names: Mapping[str, str]) -> Observations:
-        """Return the table with other names of the conditions."""
-        choices = {kind: tuple(names.get(one, one) for one in ones) for kind, ones in self.choices.items()}
-        return replace(self, conditions=tuple(names[one] for one in self.conditions), choices=choices)
+        """Return the table with policies in place of letters, in their usual order."""
+        named = [names[one] for one in self.conditions]
+        order = sorted(range(len(named)), key=lambda k: POLICY_NAMES.index(named[k]))
+        return replace(
+            self,
+            conditions=tuple(named[k] for k in order),
+            measures={name: values[:, order] for name, values in self.measures.items()},
+            places=self.places[:, order],
+            choices={kind: tuple(names.get(one, "") for one in ones) for kind, ones in self.choices.items()},
+        )
 
     def with_note(self, note: str) -> Observations:
         """Return the table with one more note."""
@@ -86,8 +94,7 @@ def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable
     if "map" in judges:
         yield (
             "reachability is judged by the map itself (no motion capture), which favours policies under "
-            "which "
-            "headset and robot drift together"
+            "which headset and robot drift together"
         )
     if statuses:
         yield "the navigator's own status of goals: " + ", ".join(

@@ -136,7 +136,7 @@ class StudyKey:
 
     policies: dict[str, str]
     salt: str
-    seed: int = 0
+    seed: str
 
     def __post_init__(self) -> None:
         for letter, name in self.policies.items():
@@ -172,7 +172,7 @@ def draw_plan(wishes: PlanWishes, seed: int, salt: str) -> tuple[StudyPlan, Stud
         raise UsageError("--policy: one is given twice; each condition has a policy of its own")
     letters = tuple(_LETTERS[:count])
     shuffled = [wishes.policies[k] for k in rng.permutation(count)]
-    key = StudyKey(dict(zip(letters, shuffled, strict=True)), salt, seed)
+    key = StudyKey(dict(zip(letters, shuffled, strict=True)), salt, str(seed))
     try:
         orders = draw_orders(count, wishes.participants, rng)
     except ValueError as error:
@@ -195,7 +195,15 @@ def draw_plan(wishes: PlanWishes, seed: int, salt: str) -> tuple[StudyPlan, Stud
 def plan_text(plan: StudyPlan) -> str:
     """Return the content of its file."""
     content = {"schema": _PLAN_SCHEMA, **dataclasses.asdict(plan), "sha256": plan.digest}
-    return json.dumps(content, indent=1) + "\n"
+    lines = [f" {json.dumps(name)}: {_rows_text(value)}" for name, value in content.items()]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _rows_text(value: Any) -> str:
+    """Return JSON, with a line for each participant or question."""
+    if isinstance(value, tuple) and value and isinstance(value[0], dict):
+        return "[\n  " + ",\n  ".join(map(json.dumps, value)) + "\n ]"
+    return json.dumps(value)
 
 
 def read_plan(folder: Path) -> StudyPlan:

@@ -18,6 +18,8 @@ from share.lab.evaluate.statistics import Interval
 from share.lab.study.resampling import LEVEL, bootstrap, mean_interval
 from share.types import F64, I64
 
+_ROUNDING = 1e-22  # part of a sum of squares, below which a sum is of rounding errors
+
 
 @dataclass(frozen=True)
 class Sphericity:
@@ -55,8 +57,8 @@ def repeated_anova(values: F64) -> RepeatedAnova:
     means = values.mean(axis=0) - values.mean()
     effect = n * float((means**2).sum())
     error = float(((values - values.mean(axis=1, keepdims=True) - means) ** 2).sum())
-    f = effect / df / (error / df_error) if error > 1e-12 * (effect + error) else math.nan
-    sphericity = _sphericity(values)
+    f = effect / df / (error / df_error) if error > _ROUNDING * float((values**2).sum()) else math.nan
+    sphericity = Sphericity(*[math.nan] * 5) if math.isnan(f) else _sphericity(values)
     gg, hf = sphericity.greenhouse_geisser, sphericity.huynh_feldt
     p, p_gg, p_hf = (_f_sf(df * eps, df_error * eps, f) for eps in (1.0, gg, hf))
     return RepeatedAnova(
@@ -68,7 +70,7 @@ def repeated_anova(values: F64) -> RepeatedAnova:
         p_hf,
         sphericity,
         _partial_eta2(f, df, df_error),
-        bootstrap(lambda weights: _generalised_eta2(values, weights), n),
+        bootstrap(lambda weights: _generalised_eta2(values - values.mean(), weights), n),
         n,
     )
 
@@ -88,10 +90,7 @@ def _sphericity(values: F64) -> Sphericity:
         return Sphericity(math.nan, math.nan, math.nan, 1.0, 1.0)
     contrasts = _orthonormal_contrasts(k)
     cov = contrasts @ np.cov(values, rowvar=False) @ contrasts.T
-    squares = float((cov**2).sum())
-    if squares == 0:
-        return Sphericity(math.nan, math.nan, math.nan, math.nan, math.nan)
-    gg = min(1.0, float(np.trace(cov)) ** 2 / (d * squares))
+    gg = min(1.0, float(np.trace(cov)) ** 2 / (d * float((cov**2).sum())))
     spare = d * (n - 1 - d * gg)
     hf = min(1.0, (n * d * gg - 2) / spare) if spare > 0 else 1.0
     if n - 1 < d or (w := _mauchly_w(cov)) <= 0:
@@ -126,8 +125,9 @@ def _generalised_eta2(values: F64, weights: F64) -> F64:
     n, k = values.shape
     grand = weights @ values.mean(axis=1) / n
     effect = n * ((weights @ values / n - grand[:, None]) ** 2).sum(axis=1)
-    total = weights @ (values**2).sum(axis=1) - n * k * grand**2
-    part: F64 = np.divide(effect, total, out=np.full(len(total), math.nan), where=total > 1e-12)
+    squares = weights @ (values**2).sum(axis=1)
+    total = squares - n * k * grand**2
+    part: F64 = np.divide(effect, total, out=np.full(len(total), math.nan), where=total > 1e-12 * squares)
     return part
 
 
@@ -231,7 +231,7 @@ def _partial_f(y: F64, blocks: dict[str, F64], name: str) -> PartialF:
     reduced = np.concatenate([block for other, block in blocks.items() if other != name], axis=1)
     (rss, rank), (rss_without, rank_without) = (_fit(y, design) for design in (full, reduced))
     df, df_error = rank - rank_without, len(y) - rank
-    if df < 1 or df_error < 1 or rss <= 1e-12 * float(y @ y):
+    if df < 1 or df_error < 1 or rss <= _ROUNDING * float(y @ y):
         return PartialF(math.nan, df, df_error, math.nan)
     f = (rss_without - rss) / df / (rss / df_error)
     return PartialF(f, df, df_error, _f_sf(df, df_error, f))

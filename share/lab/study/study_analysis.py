@@ -35,6 +35,7 @@ from share.lab.study.resampling import mean_interval
 from share.types import F64
 
 MIN_COMPLETE = 3  # participants, for a test
+_DIGITS = 9  # decimals of a value; beyond, differences are of rounding
 
 
 @dataclass(frozen=True)
@@ -122,14 +123,14 @@ def _balance(table: Observations) -> Balance | None:
 
 
 def _analyse_measure(name: str, values: F64, table: Observations) -> MeasureAnalysis:
-    names = table.conditions
+    names, values = table.conditions, values.round(_DIGITS)
     summaries = tuple(_summary(one, column) for one, column in zip(names, values.T, strict=True))
     whole = values[np.isfinite(values).all(axis=1)]
     if len(whole) < MIN_COMPLETE:
         return MeasureAnalysis(name, summaries, len(whole), None, None, (), None, None)
     ranks, anova = friedman(whole), repeated_anova(whole)
     order = order_effects(values, table.places) if (table.places > 0).any() else None
-    pairs = _pairs(whole, names, ranks)
+    pairs = () if math.isnan(ranks.chi2) else _pairs(whole, names, ranks)
     return MeasureAnalysis(name, summaries, len(whole), ranks, anova, pairs, order, next_study(whole, anova))
 
 

@@ -11,9 +11,9 @@ from share.lab.evaluate.report import bullets, csv_text, format_number, html_pag
 from share.lab.evaluate.statistics import Interval
 from share.lab.study.observations import Observations
 from share.lab.study.plan import SuccessRule
-from share.lab.study.power import NextStudy
+from share.lab.study.power import ALPHA, NextStudy
 from share.lab.study.repeated_anova import PartialF
-from share.lab.study.study_analysis import MIN_COMPLETE, MeasureAnalysis, StudyAnalysis
+from share.lab.study.study_analysis import MIN_COMPLETE, StudyAnalysis
 from share.lab.study.study_figures import draw_choices, draw_measures
 from share.robot.settings import CREATE3_SPEED_M_S
 
@@ -204,16 +204,21 @@ def coverage_lines(study: StudyAnalysis) -> list[str]:
     return [*lines, *study.notes]
 
 
-def summary_line(one: MeasureAnalysis) -> str:
-    """Return a measure's result in one line."""
-    if one.friedman is None or one.anova is None:
-        return f"{one.name}: too few complete participants ({one.complete})"
-    means = ", ".join(f"{c.condition} {format_number(c.mean.value, '.2f')}" for c in one.conditions)
-    chi2 = format_number(one.friedman.chi2, ".2f")
-    return (
-        f"{one.name}: {means}; Friedman χ²({one.friedman.df}) = {chi2}, p {p_text(one.friedman.p)}, "
-        f"W {format_number(one.friedman.concordance.value, '.2f')}; ANOVA p GG {p_text(one.anova.p_gg)}"
-    )
+def overview_rows(study: StudyAnalysis) -> Rows:
+    """Return a row for each measure: its means and its main tests."""
+    rows = [["measure", "n", *study.conditions, "Friedman", "p", "W", "ANOVA", "p GG"]]
+    for one, tested in zip(study.measures, comparison_rows(study)[1:], strict=True):
+        means = [format_number(condition.mean.value, ".2f") for condition in one.conditions]
+        _, count, chi2, p, w, f, _, p_gg, *_ = tested
+        rows.append([one.name, count, *means, chi2, p, w, f, p_gg])
+    return rows
+
+
+def differing_rows(study: StudyAnalysis) -> Rows:
+    """Return the pairs that differ by Holm's p."""
+    head, *rows = pair_rows(study)
+    pairs = [one for measure in study.measures for one in measure.pairs]
+    return [head, *(row for row, one in zip(rows, pairs, strict=True) if one.p_holm < ALPHA)]
 
 
 _POWER_NOTE = (
