@@ -28,10 +28,11 @@ def small_plan(participants: int = 4, policies: tuple[str, ...] = PAPER_POLICIES
     return draw_plan(PlanWishes(participants, policies, spots, spots, SuccessRule()), seed, "ab" * 16)
 
 
-def begin(plan: StudyPlan, participant: str, place: int, **changes: Any) -> dict[str, Any]:
-    (trial,) = [one.trials[place - 1] for one in plan.participants if one.name == participant]
-    line = {"event": "begin", "t_s": 0.0, "participant": participant, "place": place}
-    return line | {"condition": trial.condition, "plan": plan.digest, "judge": "mocap"} | changes
+def begin(of: StudyPlan, who: str, at: int, **changes: Any) -> dict[str, Any]:
+    """The first line of the trial of a participant at a place, with changes."""
+    (trial,) = [one.trials[at - 1] for one in of.participants if one.name == who]
+    line = {"event": "begin", "t_s": 0.0, "participant": who, "place": at}
+    return line | {"condition": trial.condition, "plan": of.digest, "judge": "mocap"} | changes
 
 
 def goal_events(
