@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import stat
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -210,3 +211,10 @@ def test_an_edited_plan_is_noticed(study):
     for command in (["analyze", "s"], ["unblind", "s", "--key", "s-key.json"]):
         done = study(*command)
         assert done.code == 2 and "was edited after it was made" in done.err
+
+
+def test_a_program_without_scipy_stats_and_pandas_computes_all(study, ratings, monkeypatch):
+    """The frozen program has neither."""
+    for name in ("scipy.stats", "pandas"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert study("analyze", ratings, "--out", "report").code == 0

@@ -85,7 +85,9 @@ def next_study(values: F64, anova: RepeatedAnova, sizes: Sequence[int] = _SIZES)
 def _needed(noncentrality: float, conditions: int, epsilon: float, power: float = 0.8) -> int | None:
     """Return the least number of participants with that power, by bisection, since power rises with it."""
     low, high = 2, _MAX_PARTICIPANTS
-    if anova_power(noncentrality, conditions, high, epsilon) < power:
+    if math.isinf(noncentrality):
+        return low
+    if not anova_power(noncentrality, conditions, high, epsilon) >= power:
         return None
     while low < high:
         middle = (low + high) // 2

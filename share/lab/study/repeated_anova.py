@@ -135,20 +135,42 @@ def _partial_eta2(f: float, df: int, df_error: int) -> Interval:
     if math.isnan(f):
         return Interval(math.nan, math.nan, math.nan)
     bounds = noncentrality_interval(f, df, df_error)
-    low, high = (one / (one + df + df_error + 1) for one in bounds)
+    count = df + df_error + 1
+    low, high = (1 - count / (one + count) for one in bounds)  # one may be infinite
     return Interval(f * df / (f * df + df_error), low, high)
 
 
 def noncentrality_interval(f: float, df: float, df_error: float) -> tuple[float, float]:
     """Return the 95 % interval of the noncentrality of F: the noncentralities under which f is the upper and
-    lower 2.5 % quantile; 0 where there is none."""
-    from scipy.special import fdtr, ncfdtrinc
+    lower 2.5 % quantile; 0 where there is none, infinite beyond a million."""
+    low, high = (_noncentrality(f, df, df_error, chance) for chance in ((1 + LEVEL) / 2, (1 - LEVEL) / 2))
+    return low, high
 
-    bounds = []
-    for chance in ((1 + LEVEL) / 2, (1 - LEVEL) / 2):
-        exists = float(fdtr(df, df_error, f)) > chance
-        bounds.append(float(ncfdtrinc(df, df_error, chance, f)) if exists else 0.0)
-    return bounds[0], bounds[1]
+
+_MAX_NONCENTRALITY = 1e6
+
+
+def _noncentrality(f: float, df: float, df_error: float, chance: float) -> float:
+    """Return the noncentrality under which an F below f has this chance, by bisection, as it falls with it.
+
+    scipy's `ncfdtrinc` stops at 10,000 without a word."""
+    from scipy.special import fdtr, ncfdtr
+
+    if fdtr(df, df_error, f) <= chance:
+        return 0.0
+    high = 1.0
+    while not ncfdtr(df, df_error, high, f) < chance:
+        high *= 2
+        if high > _MAX_NONCENTRALITY:
+            return math.inf
+    low = high / 2 if high > 1 else 0.0
+    while high - low > 1e-9 * high:
+        middle = (low + high) / 2
+        if ncfdtr(df, df_error, middle, f) < chance:
+            high = middle
+        else:
+            low = middle
+    return (low + high) / 2
 
 
 # Order effects.

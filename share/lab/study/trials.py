@@ -169,6 +169,7 @@ _READERS: dict[str, Callable[[TrialRecord, Mapping[str, Any], StudyPlan], None]]
     "interrupted": _read_interruption,
     "end": _read_end,
 }
+EVENT_KINDS = ("begin", *_READERS)
 
 
 def _position(value: Sequence[float]) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from share.config import POLICY_NAMES
 from share.errors import ConfigError, UsageError
 from share.lab.study.plan import PAPER_POLICIES, plan_text, read_key, read_plan, read_questions
 from share.lab.study.spots import Space, draw_spots, loop_path, read_points
+from share.lab.study.trials import EVENT_KINDS
 
 
 def save(folder: Path, text: str) -> Path:
@@ -165,3 +166,17 @@ def test_questions_are_read(tmp_path: Path) -> None:
     path.write_text("questions: []\n")
     with pytest.raises(ConfigError, match="expected a list of questions"):
         read_questions(path)
+
+
+FILES = (Path(__file__).resolve().parents[3] / "docs" / "lookup" / "files.md").read_text()
+
+
+def first_column(title: str) -> list[str]:
+    """Return the names in the first cells of the table below a heading."""
+    part = FILES.partition(f"### `{title}`\n")[2].partition("\n###")[0]
+    return re.findall(r"^\| `(\w+)` \|", part, re.MULTILINE)
+
+
+def test_the_page_on_files_has_every_key_and_event() -> None:
+    assert first_column("plan.json") == list(json.loads(plan_text(small_plan()[0])))
+    assert set(first_column("trials/PARTICIPANT-PLACE/events.jsonl")) == {"begin", *EVENT_KINDS}

@@ -138,6 +138,23 @@ def test_an_f_below_one_has_an_interval_from_zero() -> None:
     assert noncentrality_interval(0.3, 3, 57)[0] == 0.0
 
 
+@pytest.mark.parametrize("f", [0.5, 5.0, 1e3, 1e4])
+def test_bounds_of_noncentrality_are_its_quantiles(f: float) -> None:
+    from scipy.stats import ncf
+
+    low, high = noncentrality_interval(f, 3, 57)
+    assert low == 0.0 or ncf.cdf(f, 3, 57, low) == pytest.approx(0.975, abs=1e-6)
+    assert ncf.cdf(f, 3, 57, high) == pytest.approx(0.025, abs=1e-6)
+
+
+def test_an_effect_beyond_all_doubt_is_told(rng: np.random.Generator) -> None:
+    values = np.array([1.0, 2, 3, 4]) + 1e-5 * rng.normal(size=(20, 4))
+    anova = repeated_anova(values)
+    power = next_study(values, anova)
+    assert anova.partial_eta2.low == anova.partial_eta2.high == pytest.approx(1.0)
+    assert power is not None and power.needed == power.needed_at_worst == 2
+
+
 def test_order_effects_find_learning_and_what_a_condition_leaves_behind(rng: np.random.Generator) -> None:
     orders = draw_orders(4, 20, rng)
     places = np.argsort(orders, axis=1) + 1
