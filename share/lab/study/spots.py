@@ -16,7 +16,7 @@ from share.plain_data import parse_numbers
 from share.types import F64
 
 MAX_SPOTS = 200
-_TRIES, _RESTARTS = 200, 200  # per spot; of the whole draw
+_TRIES, _RESTARTS = 100, 20  # per spot; of the whole draw
 
 
 @dataclass(frozen=True)

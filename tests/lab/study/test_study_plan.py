@@ -178,5 +178,5 @@ def first_column(title: str) -> list[str]:
 
 
 def test_the_page_on_files_has_every_key_and_event() -> None:
-    assert first_column("plan.json") == list(json.loads(plan_text(small_plan()[0])))
-    assert set(first_column("trials/PARTICIPANT-PLACE/events.jsonl")) == {"begin", *EVENT_KINDS}
+    assert first_column("plan.json")[0:] == list(json.loads(plan_text(small_plan()[0])))
+    assert first_column("trials/PARTICIPANT-PLACE/events.jsonl")[1:] == list(EVENT_KINDS)
