@@ -197,8 +197,7 @@ def unblind(folder: Path, key_file: Path, early: bool) -> None:
     if done < planned and not early:
         raise UsageError(
             f"{folder}: {done} of {planned} trials are done; unblinding now ends the blindness of the "
-            f"others; "
-            "finish them, or give --early, which is recorded"
+            "others; finish them, or give --early, which is recorded"
         )
     when = datetime.now(UTC).isoformat(timespec="seconds")
     content = Unblinding(policies, plan.key_sha256, when, done, planned, done < planned)
@@ -253,7 +252,8 @@ def analyze(
     from share.files.json_file import nan_to_none
     from share.files.writing import writable_dir
     from share.lab.study.study_analysis import analyse
-    from share.lab.study.study_report import FILES, coverage_lines, rule_line, write_report
+    from share.lab.study.study_report import FILES, write_report
+    from share.lab.study.study_tables import coverage_lines, rule_line
 
     if out is not None:
         writable_dir(out, *FILES)
@@ -278,7 +278,7 @@ def analyze(
 
 def _print_tables(found: StudyAnalysis) -> None:
     from share.cli.terminal import aligned_table
-    from share.lab.study.study_report import choice_rows, differing_rows, order_rows, overview_rows
+    from share.lab.study.study_tables import choice_rows, differing_rows, order_rows, overview_rows
 
     differing = differing_rows(found)
     compared = sum(len(measure.pairs) for measure in found.measures)
@@ -331,8 +331,7 @@ def _study_table(
     if table.done < table.planned:
         raise UsageError(
             f"--key: {table.done} of {table.planned} trials are done, and the study is blind; leave --key "
-            f"out "
-            "for statistics by letters, or end its blindness with `share study unblind --early`"
+            "out for statistics by letters, or end its blindness with `share study unblind --early`"
         )
     return table.named(policies), rule
 

@@ -173,6 +173,8 @@ def test_a_table_of_another_study_is_analysed(study, ratings):
     assert "width=device-width" in page and page.count("data:image/png;base64") == 2
     rows = list(csv.DictReader(Path("report/tests.csv").read_text().splitlines()))
     assert [row["measure"] for row in rows] == ["rating", "time"]
+    assert all(float(row["Friedman p"]) < 1 and float(row["place F"]) > 0 for row in rows)
+    assert all(None not in row and None not in row.values() for row in rows)  # as many cells as names
     assert len(Path("report/pairs.csv").read_text().splitlines()) == 1 + 2 * 3
     assert r"\begin{tabular}" in Path("report/tables.tex").read_text()
 
@@ -218,3 +220,13 @@ def test_a_program_without_scipy_stats_and_pandas_computes_all(study, ratings, m
     for name in ("scipy.stats", "pandas"):
         monkeypatch.setitem(sys.modules, name, None)
     assert study("analyze", ratings, "--out", "report").code == 0
+
+
+def test_too_few_participants_have_figures_and_no_tests(study, ratings):
+    lines = ratings.read_text().splitlines(keepends=True)
+    ratings.write_text("".join(lines[:7]).replace("rating", "a|b"))
+    done = study("analyze", ratings, "--out", "report")
+    assert done.code == 0 and "2 of 2 participants are complete: too few for tests, which want 3" in done.out
+    (row, _) = csv.DictReader(Path("report/tests.csv").read_text().splitlines())
+    assert (row["n"], row["Friedman p"], row["slope a place high"]) == ("2", "", "") and None not in row
+    assert "<td>a|b</td>" in Path("report/report.html").read_text()

@@ -163,7 +163,8 @@ def read_table(path: Path, ranges: Ranges, choices_file: Path | None) -> Observa
     """
     lines = _csv_lines(path)
     head = [name.strip() for name in lines[0][1]]
-    if tuple(head[:3]) != _HEAD or len(head) < 4 or len(set(head)) < len(head):
+    is_named = all(name and name.isprintable() for name in head)
+    if tuple(head[:3]) != _HEAD or len(head) < 4 or len(set(head)) < len(head) or not is_named:
         raise DataError(
             f"{path}: its first line must be participant,condition,place and a name for each measure, each "
             f"once"
@@ -222,8 +223,8 @@ class _CsvRow:
         if len(cells) != len(head):
             raise DataError(f"{where}: {len(cells)} cells; {len(head)} are wanted")
         participant, condition, place, *values = (cell.strip() for cell in cells)
-        if not (participant and condition):
-            raise DataError(f"{where}: participant or condition is empty")
+        if not all(name and name.isprintable() for name in (participant, condition)):
+            raise DataError(f"{where}: participant or condition is empty, or not printable")
         if place and not place.isdecimal():
             raise DataError(f"{where}: place '{place:.40}' is not a whole number from 1")
         numbers = {name: _number(cell, name, where) for name, cell in zip(head[3:], values, strict=True)}

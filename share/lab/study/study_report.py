@@ -1,4 +1,4 @@
-"""The statistics of a study as text for a terminal, Markdown and HTML, CSV and LaTeX."""
+"""The report of a study: HTML and Markdown to read, CSV for programs, LaTeX for papers, figures."""
 
 from __future__ import annotations
 
@@ -7,226 +7,71 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from share.files.writing import atomic_write
-from share.lab.evaluate.report import bullets, csv_text, format_number, html_page, image_link, markdown_table
-from share.lab.evaluate.statistics import Interval
+from share.lab.evaluate.report import bullets, csv_text, html_page, image_link, markdown_table
 from share.lab.study.observations import Observations
 from share.lab.study.plan import SuccessRule
-from share.lab.study.power import ALPHA, NextStudy
 from share.lab.study.repeated_anova import PartialF
-from share.lab.study.study_analysis import MIN_COMPLETE, StudyAnalysis
+from share.lab.study.study_analysis import MeasureAnalysis, StudyAnalysis
 from share.lab.study.study_figures import draw_choices, draw_measures
-from share.robot.settings import CREATE3_SPEED_M_S
+from share.lab.study.study_tables import (
+    Rows,
+    choice_rows,
+    comparison_rows,
+    coverage_lines,
+    descriptive_rows,
+    order_rows,
+    pair_rows,
+    power_rows,
+    rule_line,
+)
 
-Rows = list[list[str]]
 FILES = ("report.html", "report.md", "descriptives.csv", "tests.csv", "pairs.csv", "tables.tex")
 METHODS = (
-    "descriptive figures are of all values there are; 95 % intervals of means and of their differences by "
-    "Student's t, over participants",
+    "descriptive figures are of all values there are; 95 % intervals of means and of their differences are "
+    "by Student's t, over participants",
     "all tests of a measure are of the participants who have it in every condition, whose number is given; "
     "nothing is filled in",
     "Friedman's chi-squared is corrected for ties; W is Kendall's",
     "with Mauchly's p below 0.05, read the ANOVA's p with Greenhouse and Geisser's epsilon (GG); with an "
-    "epsilon "
-    "above 0.75, Huynh and Feldt's (HF) is less strict",
+    "epsilon above 0.75, Huynh and Feldt's (HF) is less strict",
     "Wilcoxon's signed-rank test is two-sided; differences of zero take ranks, which are then left out "
-    "(Pratt); "
-    "p is exact over all signs, ties included, up to 50 pairs that differ, beyond by the normal "
-    "approximation; "
-    "Holm adjusts it over the pairs of a measure, not over measures",
+    "(Pratt); p is exact over all signs, ties included, up to 50 pairs that differ, beyond by the normal "
+    "approximation; Holm adjusts it over the pairs of a measure, not over measures",
     "r is the rank-biserial correlation of the pairs that differ (Kerby), above 0 where the first is greater",
     "intervals of W, of r and of generalised eta squared are percentiles of 4000 samples of participants, "
-    "drawn "
-    "with replacement; W and eta squared cannot fall below 0, so theirs lie too high where there is no "
-    "effect; "
-    "the interval of partial eta squared is by the noncentral F, as if spherical",
+    "drawn with replacement; W and eta squared cannot fall below 0, so theirs lie too high where there is "
+    "no effect; the interval of partial eta squared is by the noncentral F, as if spherical",
     "effects of place and of the condition just before (carry-over) are partial F of the model value = "
-    "participant + condition + place + condition before; the slope is of values less their condition's mean, "
-    "a "
-    "place, over each participant",
-    "preferences: against the same chance for each condition; the exact p is of a chi-squared at least as "
-    "large",
+    "participant + condition + place + condition before; the slope is of values less their condition's "
+    "mean, a place, over each participant",
+    "preferences are tested against the same chance for each condition; the exact p is of a chi-squared at "
+    "least as large",
 )
-
-
-def p_text(p: float) -> str:
-    """Return a p value with three decimals."""
-    return "–" if math.isnan(p) else "<0.001" if p < 0.001 else f"{p:.3f}"
-
-
-def _interval_text(one: Interval, form: str = ".2f") -> str:
-    if math.isnan(one.low):
-        return format_number(one.value, form)
-    return f"{one.value:{form}} [{one.low:{form}}, {one.high:{form}}]"
-
-
-def descriptive_rows(study: StudyAnalysis) -> Rows:
-    """Return a table with its head: a row for each measure and condition."""
-    head = ["measure", "condition", "n", "mean [95 %]", "SD", "median", "quartiles", "range"]
-    rows = [head]
-    for measure in study.measures:
-        for one in measure.conditions:
-            sd, median, *others = (
-                format_number(value, ".2f")
-                for value in (
-                    *(
-                        one.deviation,
-                        one.median,
-                        one.lower_quartile,
-                        one.upper_quartile,
-                        one.least,
-                        one.greatest,
-                    ),
-                )
-            )
-            spans = [f"{others[0]} to {others[1]}", f"{others[2]} to {others[3]}"]
-            rows.append(
-                [measure.name, one.condition, str(one.count), _interval_text(one.mean), sd, median, *spans]
-            )
-    return rows
-
-
-def comparison_rows(study: StudyAnalysis) -> Rows:
-    """Return Friedman and ANOVA of each measure."""
-    head = [
-        "measure",
-        "n",
-        "Friedman",
-        "p",
-        "W [95 %]",
-        "ANOVA",
-        "p",
-        "p GG",
-        "p HF",
-        "Mauchly W",
-        "p",
-        "ε GG",
-    ]
-    rows = [[*head, "ε HF", "partial η² [95 %]", "generalised η² [95 %]"]]
-    for one in study.measures:
-        if one.friedman is None or one.anova is None:
-            rows.append([one.name, str(one.complete), *["–"] * 13])
-            continue
-        ranks, anova, sphericity = one.friedman, one.anova, one.anova.sphericity
-        rows.append(
-            [
-                *(one.name, str(one.complete), f"χ²({ranks.df}) = {format_number(ranks.chi2, '.2f')}"),
-                *(p_text(ranks.p), _interval_text(ranks.concordance)),
-                f"F({anova.df}, {anova.df_error}) = {format_number(anova.f, '.2f')}",
-                *(p_text(p) for p in (anova.p, anova.p_gg, anova.p_hf)),
-                *(format_number(sphericity.w, ".3f"), p_text(sphericity.p)),
-                format_number(sphericity.greenhouse_geisser, ".3f"),
-                format_number(sphericity.huynh_feldt, ".3f"),
-                *(_interval_text(value, ".3f") for value in (anova.partial_eta2, anova.generalised_eta2)),
-            ]
-        )
-    return rows
-
-
-def pair_rows(study: StudyAnalysis) -> Rows:
-    """Return every pair of conditions of each measure."""
-    head = ["measure", "pair", "difference [95 %]", "Wilcoxon W", "differ", "p", "p Holm", "p Nemenyi"]
-    rows = [[*head, "r [95 %]"]]
-    for measure in study.measures:
-        for one in measure.pairs:
-            test = one.wilcoxon
-            rows.append(
-                [
-                    *(measure.name, f"{one.first} – {one.second}", _interval_text(one.difference)),
-                    *(f"{test.w:g}", f"{test.pairs} of {test.total_pairs}"),
-                    p_text(test.p) + ("" if test.is_exact else " (normal)"),
-                    *(p_text(one.p_holm), p_text(one.p_nemenyi), _interval_text(test.rank_biserial)),
-                ]
-            )
-    return rows
-
-
-def order_rows(study: StudyAnalysis) -> Rows:
-    """Return effects of place and carry-over on each measure; the head alone where none is known."""
-    rows = [["measure", "place", "p", "carry-over", "p", "slope a place [95 %]"]]
-    for one in study.measures:
-        if one.order is not None:
-            place, carry = one.order.place, one.order.carry_over
-            rows.append(
-                [
-                    *(one.name, _f_text(place), p_text(place.p), _f_text(carry), p_text(carry.p)),
-                    _interval_text(one.order.slope, ".3f"),
-                ]
-            )
-    return rows
-
-
-def _f_text(one: PartialF) -> str:
-    return f"F({one.df}, {one.df_error}) = {one.f:.2f}" if not math.isnan(one.f) else "–"
-
-
-def choice_rows(study: StudyAnalysis) -> Rows:
-    """Return the preferences; the head alone where there are none."""
-    rows = [["", *study.conditions, "χ²", "p", "exact p"]]
-    for kind, one in study.choices.items():
-        counts = [str(count) for count in one.counts]
-        statistic = f"χ²({one.df}) = {format_number(one.chi2, '.2f')}"
-        rows.append([f"{kind} preferred", *counts, statistic, p_text(one.p), p_text(one.p_exact)])
-    return rows
-
-
-def power_rows(study: StudyAnalysis) -> Rows:
-    """Return power by number of participants; the head alone where there is no F."""
-    known = [(one.name, one.next) for one in study.measures if one.next is not None]
-    if not known:
-        return [["measure"]]
-    rows = [["measure", "test", *map(str, known[0][1].sizes), "n for 80 %"]]
-    for name, power in known:
-        rows.append([name, "ANOVA", *(f"{p:.2f}" for p in power.anova), _needed_text(power)])
-        rows.append([name, "Friedman", *(f"{p:.2f}" for p in power.friedman), ""])
-    return rows
-
-
-def _needed_text(power: NextStudy) -> str:
-    needed, worst = (
-        "over 500" if count is None else str(count) for count in (power.needed, power.needed_at_worst)
-    )
-    return f"{needed} ({worst} at the interval's lower end)"
-
-
-def coverage_lines(study: StudyAnalysis) -> list[str]:
-    """Say how much of the study there is, how the orders were balanced, and what a reader must know."""
-    lines = [f"{study.participants} participants, conditions {', '.join(study.conditions)}"]
-    if study.done < study.planned:
-        lines.append(f"NOT THE WHOLE STUDY: {study.done} of {study.planned} trials")
-    lines += [
-        f"{one.name}: {one.complete} of {study.participants} participants are complete"
-        + ("" if one.complete >= MIN_COMPLETE else f": too few for tests, which want {MIN_COMPLETE}")
-        for one in study.measures
-        if one.complete < study.participants
-    ]
-    if study.balance is not None:
-        lines += [f"orders as carried out: {line}" for line in study.balance.lines(list(study.conditions))]
-    return [*lines, *study.notes]
-
-
-def overview_rows(study: StudyAnalysis) -> Rows:
-    """Return a row for each measure: its means and its main tests."""
-    rows = [["measure", "n", *study.conditions, "Friedman", "p", "W", "ANOVA", "p GG"]]
-    for one, tested in zip(study.measures, comparison_rows(study)[1:], strict=True):
-        means = [format_number(condition.mean.value, ".2f") for condition in one.conditions]
-        _, count, chi2, p, w, f, _, p_gg, *_ = tested
-        rows.append([one.name, count, *means, chi2, p, w, f, p_gg])
-    return rows
-
-
-def differing_rows(study: StudyAnalysis) -> Rows:
-    """Return the pairs that differ by Holm's p."""
-    head, *rows = pair_rows(study)
-    pairs = [one for measure in study.measures for one in measure.pairs]
-    return [head, *(row for row, one in zip(rows, pairs, strict=True) if one.p_holm < ALPHA)]
-
-
 _POWER_NOTE = (
     "With the effect as found here, which a next study may not find. ANOVA: by the noncentral F, with the "
     "unbiased estimate of its noncentrality; Friedman: by 2000 samples of these participants, whose effect "
-    "is "
-    "on average too large. Plan with a lesser effect."
+    "is on average too large. Plan with a lesser effect."
 )
+
+
+def write_report(
+    study: StudyAnalysis, table: Observations, rule: SuccessRule | None, out: Path
+) -> list[Path]:
+    """Write the report to a folder; return its files. rule: of success, where goals were judged by one."""
+    pictures = [image_link("Means with 95 % intervals; a dot is a participant", "study.png")]
+    draw_measures(out / "study.png", study, table)
+    (out / "preferences.png").unlink(missing_ok=True)  # of an earlier report
+    if study.choices:
+        draw_choices(out / "preferences.png", study)
+        pictures.append(image_link("Preferences", "preferences.png"))
+    text = "\n\n".join(_sections(study, pictures, rule)) + "\n"
+    atomic_write(out / "descriptives.csv", _descriptives_csv(study))
+    atomic_write(out / "tests.csv", _tests_csv(study))
+    atomic_write(out / "pairs.csv", _pairs_csv(study))
+    atomic_write(out / "tables.tex", _latex(study))
+    atomic_write(out / "report.md", text)
+    atomic_write(out / "report.html", html_page("Study", text, out))
+    return [out / name for name in FILES]
 
 
 def _sections(study: StudyAnalysis, pictures: Sequence[str], rule: SuccessRule | None) -> list[str]:
@@ -241,42 +86,94 @@ def _sections(study: StudyAnalysis, pictures: Sequence[str], rule: SuccessRule |
         ("The next study", power_rows(study), _POWER_NOTE),
     ):
         if len(rows) > 1:
-            parts += [f"## {title}", *([note] if note else []), markdown_table(rows)]
+            cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+            parts += [f"## {title}", *([note] if note else []), markdown_table(cells)]
     return [*parts, "## How it was computed", bullets(METHODS)]
 
 
-def write_report(
-    study: StudyAnalysis, table: Observations, rule: SuccessRule | None, out: Path
-) -> list[Path]:
-    """Write the report to a folder; return its files. rule: of success, where goals were judged by one."""
-    pictures = [image_link("Means with 95 % intervals; a dot is a participant", "study.png")]
-    draw_measures(out / "study.png", study, table)
-    (out / "preferences.png").unlink(missing_ok=True)  # of an earlier report
-    if study.choices:
-        draw_choices(out / "preferences.png", study)
-        pictures.append(image_link("Preferences", "preferences.png"))
-    text = "\n\n".join(_sections(study, pictures, rule)) + "\n"
+# CSV: numbers alone, an empty cell where there is none.
+
+
+def _bounds(name: str) -> tuple[str, str, str]:
+    return name, f"{name} low", f"{name} high"
+
+
+def _descriptives_csv(study: StudyAnalysis) -> str:
+    head = [*("measure", "condition", "n"), *_bounds("mean"), *("SD", "min", "q1", "median", "q3", "max")]
+    rows = [
+        [
+            *(measure.name, one.condition, one.count, *one.mean, one.deviation),
+            *(one.least, one.lower_quartile, one.median, one.upper_quartile, one.greatest),
+        ]
+        for measure in study.measures
+        for one in measure.conditions
+    ]
+    return csv_text(head, rows)
+
+
+_TESTS_HEAD = (
+    *("measure", "n", "Friedman chi2", "Friedman df", "Friedman p", *_bounds("W")),
+    *("F", "df", "df error", "p", "p GG", "p HF", "Mauchly W", "Mauchly chi2", "Mauchly p"),
+    *("epsilon GG", "epsilon HF", *_bounds("partial eta2"), *_bounds("generalised eta2")),
+    *(f"{effect} {name}" for effect in ("place", "carry-over") for name in ("F", "df", "df error", "p")),
+    *_bounds("slope a place"),
+)
+
+
+def _tests_csv(study: StudyAnalysis) -> str:
+    return csv_text(_TESTS_HEAD, (_test_cells(one) for one in study.measures))
+
+
+def _test_cells(one: MeasureAnalysis) -> list[object]:
+    cells: list[object] = [one.name, one.complete]
+    if one.friedman is not None and one.anova is not None:
+        ranks, anova, sphericity = one.friedman, one.anova, one.anova.sphericity
+        cells += [ranks.chi2, ranks.df, ranks.p, *ranks.concordance]
+        cells += [anova.f, anova.df, anova.df_error, anova.p, anova.p_gg, anova.p_hf]
+        cells += [sphericity.w, sphericity.chi2, sphericity.p]
+        cells += [sphericity.greenhouse_geisser, sphericity.huynh_feldt]
+        cells += [*anova.partial_eta2, *anova.generalised_eta2]
+    else:
+        cells += [math.nan] * 23
+    if one.order is not None:
+        cells += [*_partial_cells(one.order.place), *_partial_cells(one.order.carry_over), *one.order.slope]
+    else:
+        cells += [math.nan] * 11
+    return cells
+
+
+def _partial_cells(one: PartialF) -> tuple[float, ...]:
+    return one.f, one.df, one.df_error, one.p
+
+
+def _pairs_csv(study: StudyAnalysis) -> str:
+    head = [
+        *("measure", "first", "second", *_bounds("difference"), "Wilcoxon W", "differ", "n", "p", "exact"),
+        *("p Holm", "p Nemenyi", *_bounds("r")),
+    ]
+    rows = [
+        [
+            *(measure.name, one.first, one.second, *one.difference),
+            *(one.wilcoxon.w, one.wilcoxon.pairs, one.wilcoxon.total_pairs),
+            *(one.wilcoxon.p, int(one.wilcoxon.is_exact), one.p_holm, one.p_nemenyi),
+            *one.wilcoxon.rank_biserial,
+        ]
+        for measure in study.measures
+        for one in measure.pairs
+    ]
+    return csv_text(head, rows)
+
+
+# LaTeX.
+
+
+def _latex(study: StudyAnalysis) -> str:
     tables = {
-        "descriptives": (descriptive_rows(study), "Descriptive figures"),
-        "tests": (comparison_rows(study), "Friedman's test and repeated-measures ANOVA"),
-        "pairs": (pair_rows(study), "Pairs of conditions"),
+        "Descriptive figures": descriptive_rows(study),
+        "Friedman's test and repeated-measures ANOVA": comparison_rows(study),
+        "Pairs of conditions": pair_rows(study),
     }
-    for name, (rows, _) in tables.items():
-        atomic_write(out / f"{name}.csv", csv_text(rows[0], rows[1:]))
-    latex = [latex_table(rows, caption) for rows, caption in tables.values()]
-    atomic_write(out / "tables.tex", "\n\n".join(latex) + "\n")
-    atomic_write(out / "report.md", text)
-    atomic_write(out / "report.html", html_page("Study", text, out))
-    return [out / name for name in FILES]
-
-
-def rule_line(rule: SuccessRule) -> str:
-    """Say when a goal is reached."""
-    return (
-        f"a goal is reached if the robot stands within {rule.distance_m:g} m of the cube within "
-        f"{rule.timeout_s:g} s of the call; the longer time-out adds the way's length / {CREATE3_SPEED_M_S} "
-        f"m/s"
-    )
+    return "\n\n".join(latex_table(rows, caption) for caption, rows in tables.items()) + "\n"
 
 
 def latex_table(rows: Rows, caption: str) -> str:
@@ -292,16 +189,17 @@ def latex_table(rows: Rows, caption: str) -> str:
     return "\n".join([*lines, head, r"\hline", *body, r"\hline", r"\end{tabular}", r"\end{table}"])
 
 
-_LATEX = {
-    **{char: "\\" + char for char in "&%$#_{}"},
-    **{
-        "\\": r"\textbackslash{}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "<": "$<$",
-        ">": "$>$",
-    },
-    **{"χ": r"$\chi$", "²": "$^2$", "η": r"$\eta$", "ε": r"$\epsilon$", "–": "--"},
+_LATEX = {char: "\\" + char for char in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": "$<$",
+    ">": "$>$",
+    "χ": r"$\chi$",
+    "²": "$^2$",
+    "η": r"$\eta$",
+    "ε": r"$\epsilon$",
+    "–": "--",
 }
 
 
