@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import secrets
 from dataclasses import asdict
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from share.lab.study.plan import StudyPlan, SuccessRule
     from share.lab.study.study_analysis import StudyAnalysis
 
-_PAPER = ("share", "covins-g", "linear", "equal")
-
 
 @click.group(cls=CommandGroup, prefix="study ")
 def study() -> None:
@@ -36,6 +35,16 @@ def study() -> None:
               share study unblind study --key study-key.json
               share study analyze study --out report
     """
+
+
+class _Amount(click.FloatRange):
+    """A number within a range, and no NaN, which click lets pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number: float = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"'{value}' is not a number", param, ctx)
+        return number
 
 
 class _Numbers(click.ParamType[tuple[float, ...]]):
@@ -52,8 +61,8 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
         try:
             a, b = (float(part) for part in value.split(self._separator))
         except ValueError:
-            a = b = float("nan")
-        if not max(abs(a), abs(b)) <= 1000:
+            a = b = math.nan
+        if not all(abs(number) <= 1000 for number in (a, b)):
             self.fail(f"'{value}' is not two numbers such as {self._example}", param, ctx)
         return a, b
 
@@ -74,8 +83,8 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     "--corner", type=_Numbers(",", "-2,-2"), default="0,0", metavar="X,Y", help="Its least x and y, m."
 )
 @click.option("--spots", type=click.IntRange(1, 200), default=10, help="Spots to draw.")
-@click.option("--margin", type=click.FloatRange(0, 100), default=0.5, help="From the edge of the floor, m.")
-@click.option("--apart", type=click.FloatRange(0, 100), default=0.8, help="Spots from each other, m.")
+@click.option("--margin", type=_Amount(0, 100), default=0.5, help="From the edge of the floor, m.")
+@click.option("--apart", type=_Amount(0, 100), default=0.8, help="Spots from each other, m.")
 @click.option(
     "--spots-file",
     metavar="FILE",
@@ -91,8 +100,8 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--questions", metavar="FILE", type=options.EXISTING_FILE, help="Questions of your own, YAML `questions`."
 )
-@click.option("--distance", type=click.FloatRange(0.01, 100), default=0.5, help="Of success, m.")
-@click.option("--timeout", type=click.FloatRange(0.1, 3600), default=30.0, help="Of success, s.")
+@click.option("--distance", type=_Amount(0.01, 100), default=0.5, help="Of success, m.")
+@click.option("--timeout", type=_Amount(0.1, 3600), default=30.0, help="Of success, s.")
 @click.option("--seed", type=click.IntRange(0, 2**63), help="Of the whole plan.  [default: drawn]")
 @click.option(
     "--key", "key_file", metavar="FILE", type=options.PATH, help="The key.  [default: DIR-key.json]"
@@ -127,7 +136,15 @@ def plan(
     """
     import numpy as np
 
-    from share.lab.study.plan import PLAN, QUESTIONS, PlanWishes, SuccessRule, draw_plan, read_questions
+    from share.lab.study.plan import (
+        PAPER_POLICIES,
+        PLAN,
+        QUESTIONS,
+        PlanWishes,
+        SuccessRule,
+        draw_plan,
+        read_questions,
+    )
     from share.lab.study.spots import Space, draw_spots, loop_path, read_points
 
     floor = Space(*space, *corner)
@@ -137,12 +154,12 @@ def plan(
     for path in (plan_path, key_path):
         if path.exists():
             raise UsageError(f"{path}: exists and is not overwritten; give a new --out or --key")
-    if key_path.resolve().parent == out.resolve():
+    if key_path.resolve().is_relative_to(out.resolve()):
         raise UsageError(f"--key {key_path}: lies beside the plan; give a name outside of {out}")
     drawn_seed = secrets.randbits(63) if seed is None else seed
     wishes = PlanWishes(
         participants,
-        policies or _PAPER,
+        policies or PAPER_POLICIES,
         draw_spots(floor, spots, margin, apart, np.random.default_rng([drawn_seed, 1]))
         if spots_file is None
         else read_points(spots_file, "spots", 1, floor),
@@ -225,8 +242,8 @@ def unblind(folder: Path, key_file: Path, early: bool) -> None:
     metavar="NAME=LOW:HIGH",
     help="With a CSV: the range of a measure, beyond which a value is an error; may be repeated.",
 )
-@click.option("--distance", type=click.FloatRange(0.01, 100), help="Of success, m.  [default: the plan's]")
-@click.option("--timeout", type=click.FloatRange(0.1, 3600), help="Of success, s.  [default: the plan's]")
+@click.option("--distance", type=_Amount(0.01, 100), help="Of success, m.  [default: the plan's]")
+@click.option("--timeout", type=_Amount(0.1, 3600), help="Of success, s.  [default: the plan's]")
 @click.option("--out", metavar="DIR", type=options.PATH, help="Folder for the report.")
 @options.as_json
 def analyze(
@@ -358,4 +375,4 @@ def _float(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        return float("nan")
+        return math.nan

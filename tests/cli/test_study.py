@@ -62,6 +62,8 @@ def test_nothing_is_overwritten(study, kept):
         (["--policy", "share", "--policy", "share"], "one is given twice"),
         (["--policy", "shar"], "'shar' is not"),
         (["--space", "4"], "is not two numbers such as 4x4"),
+        (["--space", "4xnan"], "is not two numbers such as 4x4"),
+        (["--distance", "nan"], "'nan' is not a number"),
         (["--space", "4x-4"], "both must be positive"),
         (["--space", "1x1"], "nothing is left of 1 x 1 m"),
         (["--spots", "30", "--apart", "2"], "30 spots 2 m apart were not found"),

@@ -14,5 +14,5 @@
     study_figures   and as pictures
     study_report    HTML, CSV, LaTeX
 
-Only `plan` knows that there are policies behind the letters; no other module needs to.
+Letters become policies in `plan` and `observations`; all else knows conditions by the names that it is given.
 """
