@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -217,10 +218,32 @@ def test_the_next_study_needs_more_for_the_effects_lower_bound(rng: np.random.Ge
 def test_intervals_are_of_participants() -> None:
     values = np.array([1.0, 2.0, 3.0, 6.0])
     drawn = bootstrap(lambda weights: weights @ values / weights.sum(axis=1), 4)
-    samples = [np.mean(one) for one in itertools.product(values, repeat=4)]
-    bounds = np.quantile(samples, [0.025, 0.975])
+    samples = np.array([np.mean(one) for one in itertools.product(values, repeat=4)])
+    normal = NormalDist()
+    shift = normal.inv_cdf(((samples < 3).sum() + (samples == 3).sum() / 2) / 256)
+    bounds = np.quantile(samples, [normal.cdf(2 * shift + z) for z in (-1.96, 1.96)])
     assert drawn.value == 3.0 and (drawn.low, drawn.high) == pytest.approx(bounds, abs=0.26)  # a step
     assert mean_interval(np.array([1.0, np.nan, 3.0])) == pytest.approx(
         (2.0, 2 - 12.7062, 2 + 12.7062), abs=1e-4
     )
     assert math.isnan(mean_interval(np.array([5.0])).low)
+
+
+@pytest.mark.long
+def test_intervals_of_effect_sizes_hold_the_truth_about_as_often_as_they_say(
+    rng: np.random.Generator,
+) -> None:
+    """Of 150 studies of 20 participants with a medium effect: three standard errors below what is documented,
+    0.89 and 0.93."""
+    means = np.array([0.4, 0.0, 0.0, -0.4])
+    variance = float((means**2).mean())
+    truths = variance / (variance + 2), 2 * NormalDist().cdf(0.8) - 1
+    inside = []
+    for _ in range(150):
+        values = rng.normal(size=(20, 1)) + rng.normal(size=(20, 4)) + means
+        intervals = (
+            repeated_anova(values).generalised_eta2,
+            wilcoxon(values[:, 0], values[:, 3]).rank_biserial,
+        )
+        inside.append([one.low <= truth <= one.high for one, truth in zip(intervals, truths, strict=True)])
+    assert (np.mean(inside, axis=0) > (0.81, 0.865)).all()
