@@ -5,23 +5,29 @@ each: 142, 114, 110 and 86 of 200) and a Friedman chi-squared of 13.24, taken he
 drawn study has these sums and this chi-squared, to two decimals; what differs between them is what the
 figures leave open. The first is written as CSV.
 
-    python tools/experiments/study_paper_example.py --studies 200 --out reached.csv
+    python tools/experiments/study_paper_example.py --studies 12 --out reached.csv
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-import numpy as np
+from share import startup
 
-from share.files.writing import atomic_write
-from share.lab.evaluate.report import csv_text
-from share.lab.study.orders import draw_orders
-from share.lab.study.plan import PAPER_POLICIES
-from share.lab.study.rank_tests import friedman, holm, wilcoxon
-from share.lab.study.repeated_anova import repeated_anova
-from share.types import F64
+startup.prepare_process()
+
+import numpy as np  # noqa: E402
+from tool_main import exit_code  # noqa: E402
+
+from share.files.writing import atomic_write  # noqa: E402
+from share.lab.evaluate.report import csv_text  # noqa: E402
+from share.lab.study.orders import draw_orders  # noqa: E402
+from share.lab.study.plan import PAPER_POLICIES  # noqa: E402
+from share.lab.study.rank_tests import friedman, holm, wilcoxon  # noqa: E402
+from share.lab.study.repeated_anova import repeated_anova  # noqa: E402
+from share.types import F64  # noqa: E402
 
 SUMS, CALLS, PARTICIPANTS, CHI2 = (142, 114, 110, 86), 10, 20, 13.24
 _STEPS = 4000  # of a search
@@ -64,9 +70,9 @@ def draw_study(rng: np.random.Generator) -> F64:
                 values, distance = moved, changed
 
 
-def main() -> None:
+def _draw_all() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--studies", type=int, default=200)
+    parser.add_argument("--studies", type=int, default=12)
     parser.add_argument("--seed", type=int, default=43)
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
@@ -91,4 +97,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code("study_paper_example.py", _draw_all))

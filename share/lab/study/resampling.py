@@ -18,7 +18,7 @@ from share.types import F64
 DRAWS = 4000
 LEVEL = 0.95
 _SEED = 1  # the same data give the same interval
-_MAX_CELLS = 4_000_000  # draws x participants
+_MAX_CELLS = 1_000_000  # draws x participants
 
 
 def bootstrap(value: Callable[[F64], F64], participants: int) -> Interval:

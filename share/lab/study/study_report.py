@@ -39,9 +39,9 @@ METHODS = (
     "approximation; Holm adjusts it over the pairs of a measure, not over measures",
     "r is the rank-biserial correlation of the pairs that differ (Kerby), above 0 where the first is greater",
     "intervals of W, of r and of generalised eta squared are bias-corrected percentiles (Efron's BC) of 4000 "
-    "samples of participants, drawn with replacement; W and eta squared cannot fall below 0, so theirs lie "
-    "too high where there is no effect; the interval of partial eta squared is by the noncentral F, as if "
-    "spherical",
+    "samples of participants (fewer beyond 250 of them), drawn with replacement; W and eta squared cannot "
+    "fall below 0, so theirs lie too high where there is no effect; the interval of partial eta squared is "
+    "by the noncentral F, as if spherical",
     "effects of place and of the condition just before (carry-over) are partial F of the model value = "
     "participant + condition + place + condition before; the slope is of values less their condition's "
     "mean, a place, over each participant",
