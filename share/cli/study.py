@@ -208,7 +208,8 @@ def unblind(folder: Path, key_file: Path, early: bool) -> None:
     from share.lab.study.trials import read_trials
 
     plan = read_plan(folder)
-    policies = renamed(plan.letters, read_key(key_file, plan).policies, str(key_file))
+    key = read_key(key_file, plan)
+    policies = renamed(plan.letters, key.policies, str(key_file))
     planned = len(plan.participants) * len(plan.letters)
     done = sum(record.is_complete for record in read_trials(folder, plan).values())
     if done < planned and not early:
@@ -217,7 +218,7 @@ def unblind(folder: Path, key_file: Path, early: bool) -> None:
             "others; finish them, or give --early, which is recorded"
         )
     when = datetime.now(UTC).isoformat(timespec="seconds")
-    content = Unblinding(policies, plan.key_sha256, when, done, planned, done < planned)
+    content = Unblinding(key, when, done, planned, done < planned)
     with new_file(folder / UNBLINDED) as file:
         file.write(unblinding_text(content).encode())
     for letter, policy in policies.items():
@@ -341,7 +342,7 @@ def _study_table(
             early = f"unblinded early, with {unblinding.done} of {unblinding.planned} trials done"
             print_note(str(folder), early)
             table = table.with_note(early)
-        return table.named(renamed(plan.letters, unblinding.policies, str(folder))), rule
+        return table.named(renamed(plan.letters, unblinding.key.policies, str(folder))), rule
     if key_file is None:
         return table, rule
     policies = renamed(plan.letters, read_key(key_file, plan).policies, str(key_file))

@@ -117,6 +117,17 @@ def test_unblinding_early_is_refused_and_recorded(study):
     assert done.code == 2 and "exists and is not overwritten" in done.err
 
 
+def test_an_edited_record_of_the_unblinding_is_noticed(study):
+    carry_out(planned(study))
+    assert study("unblind", "s", "--key", "s-key.json").code == 0
+    record = Path("s/unblinded.json")
+    record.write_text(
+        record.read_text().replace("linear", "x").replace("equal", "linear").replace('"x"', '"equal"')
+    )
+    done = study("analyze", "s")
+    assert done.code == 2 and "was edited, or is of another plan" in done.err
+
+
 def test_a_swapped_key_is_noticed(study):
     policies = planned(study)
     carry_out(policies)

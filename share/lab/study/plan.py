@@ -151,6 +151,11 @@ class StudyKey:
         """Return the content of its file."""
         return json.dumps({"schema": _KEY_SCHEMA, **dataclasses.asdict(self)}, indent=1) + "\n"
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its file, which the plan carries."""
+        return hashlib.sha256(self.text().encode()).hexdigest()
+
 
 @dataclass(frozen=True)
 class PlanWishes:
@@ -187,8 +192,9 @@ def draw_plan(wishes: PlanWishes, seed: int, salt: str) -> tuple[StudyPlan, Stud
         for number, order in enumerate(orders, 1)
     )
     spots, path = (tuple((x, y) for x, y in points.tolist()) for points in (wishes.spots, wishes.path))
-    sealed = hashlib.sha256(key.text().encode()).hexdigest()
-    plan = StudyPlan(letters, sealed, spots, path, people, success=wishes.success, questions=wishes.questions)
+    plan = StudyPlan(
+        letters, key.digest, spots, path, people, success=wishes.success, questions=wishes.questions
+    )
     return plan, key
 
 
@@ -270,10 +276,9 @@ def renamed(letters: Sequence[str], policies: Mapping[str, str], where: str) -> 
 
 @dataclass(frozen=True)
 class Unblinding:
-    """The policies behind the letters, and how much of the study was done when they were told."""
+    """The key, and how much of the study was done when it was told."""
 
-    policies: dict[str, str]
-    key_sha256: str
+    key: StudyKey
     when: str
     done: int
     planned: int
@@ -292,6 +297,8 @@ def read_unblinding(study: Path, plan: StudyPlan) -> Unblinding | None:
         return None
     data = _without_schema(read_json(path), _UNBLINDED_SCHEMA, path)
     unblinding = from_mapping(Unblinding, data, str(path))
-    if unblinding.key_sha256 != plan.key_sha256:
-        raise ConfigError(f"{path}: is of another plan; remove it, and run `share study unblind` again")
+    if unblinding.key.digest != plan.key_sha256:
+        raise ConfigError(
+            f"{path}: was edited, or is of another plan; remove it, and run `share study unblind` again"
+        )
     return unblinding

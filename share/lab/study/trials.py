@@ -129,7 +129,7 @@ def _read_call(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -
     cube, robot = (_position(event[name]) for name in ("cube_m", "robot_m"))
     straight_m = math.dist(cube, robot)
     goal = CalledGoal(
-        int(event["spot"]), float(event["t_s"]), cube, straight_m, float(event.get("path_m", straight_m))
+        int(event["spot"]), _number(event["t_s"]), cube, straight_m, _number(event.get("path_m", straight_m))
     )
     number = int(event["goal"])
     if not (1 <= number <= len(plan.spots) and 1 <= goal.spot <= len(plan.spots)):
@@ -146,7 +146,7 @@ def _read_moves(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) 
 def _read_stands(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
     goal = record.goals[event["goal"]]
     distance_m = math.dist(goal.cube, _position(event["robot_m"]))
-    goal.stops.append(RobotStop(_since_call(goal, event), distance_m, float(event["path_m"])))
+    goal.stops.append(RobotStop(_since_call(goal, event), distance_m, _number(event["path_m"])))
 
 
 def _read_status(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
@@ -172,13 +172,19 @@ _READERS: dict[str, Callable[[TrialRecord, Mapping[str, Any], StudyPlan], None]]
 EVENT_KINDS = ("begin", *_READERS)
 
 
-def _position(value: Sequence[float]) -> tuple[float, float]:
+def _position(value: Sequence[Any]) -> tuple[float, float]:
     x, y = value
-    return float(x), float(y)
+    return _number(x), _number(y)
+
+
+def _number(value: Any) -> float:
+    if type(value) not in (int, float):
+        raise TypeError(f"{value!r:.40} is not a number")
+    return float(value)
 
 
 def _since_call(goal: CalledGoal, event: Mapping[str, Any]) -> float:
-    s = float(event["t_s"]) - goal.called_s
+    s = _number(event["t_s"]) - goal.called_s
     if s < 0:
         raise ValueError(f"t_s {event['t_s']} is before the call at {goal.called_s}")
     return s

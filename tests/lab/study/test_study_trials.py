@@ -103,6 +103,10 @@ def test_a_power_cut_costs_one_line(tmp_path: Path) -> None:
         ([begin(PLAN, P01, 1), {"event": "dance"}], "event 'dance' is not known"),
         ([begin(PLAN, P01, 1), {"t_s": 1}], "line 2: is damaged"),
         ([begin(PLAN, P01, 1), {"event": "moves", "t_s": 1.0, "goal": 1}], "line 2: is damaged"),
+        (
+            [begin(PLAN, P01, 1), {**goal_events(1, 1, None, 1.0)[0], "cube_m": ["nan", 1]}],
+            "'nan' is not a number",
+        ),
         ([begin(PLAN, P01, 1), *goal_events(3, 1, None, 1.0)], "goal 3 at spot 1; the plan has 2"),
         ([begin(PLAN, P01, 1), *goal_events(1, 1, -5.0, 9.0)], "is before the call"),
         (
