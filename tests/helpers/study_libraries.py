@@ -70,7 +70,8 @@ def by_libraries(data: dict[str, Any]) -> dict[str, Any]:
     if values.shape[1] > 2:
         out["p gg"] = effect["p_GG_corr"]
         mauchly = pg.sphericity(wide)
-        out["mauchly"] = [mauchly.W, mauchly.chi2, mauchly.pval]
+        if mauchly.W > 0:  # of a singular covariance pingouin says p = 0, and SHARE that there is no test
+            out["mauchly"] = [mauchly.W, mauchly.chi2, mauchly.pval]
         out["huynh-feldt"] = pg.epsilon(wide, correction="hf")
     long = whole.reset_index().melt(id_vars="index")
     fit = AnovaRM(long, "value", "index", within=["variable"]).fit().anova_table.iloc[0]
