@@ -23,8 +23,8 @@ _ROUNDING = 1e-22  # part of a sum of squares, below which a sum is of rounding 
 
 @dataclass(frozen=True)
 class Sphericity:
-    """Mauchly's test, NaN with two conditions or a singular covariance (too few participants); epsilons, 1 where variances of all
-    differences are alike."""
+    """Mauchly's test, NaN with two conditions or a singular covariance, as of too few participants; epsilons,
+    1 where variances of all differences are alike."""
 
     w: float
     chi2: float
