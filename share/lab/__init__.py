@@ -1,1 +1,1 @@
-"""The laboratory: emulator, calibration, evaluation, training. The product never imports it."""
+"""The laboratory: emulator, calibration, evaluation, training, studies. The product never imports it."""

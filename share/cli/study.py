@@ -1,0 +1,379 @@
+"""`share study`: plan a study with people by letters, unblind it at its end, analyse it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import secrets
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.commands import CommandGroup
+from share.cli.terminal import print_note
+from share.config import POLICY_NAMES
+from share.errors import UsageError
+
+if TYPE_CHECKING:
+    from share.lab.study.observations import Observations
+    from share.lab.study.plan import StudyPlan, SuccessRule
+    from share.lab.study.study_analysis import StudyAnalysis
+
+
+@click.group(cls=CommandGroup, prefix="study ")
+def study() -> None:
+    """Plan a blind study with people, unblind it at its end, and analyse it.
+
+    \b
+    Example:  share study plan --participants 20 --out study
+              share study analyze study --out first-look
+              share study unblind study --key study-key.json
+              share study analyze study --out report
+    """
+
+
+class _Amount(click.FloatRange):
+    """A number within a range, and no NaN, which click lets pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number: float = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"'{value}' is not a number", param, ctx)
+        return number
+
+
+class _Numbers(click.ParamType[tuple[float, ...]]):
+    """Two numbers with a character between them."""
+
+    def __init__(self, separator: str, example: str) -> None:
+        self.name, self._separator, self._example = "numbers", separator, example
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            a, b = (float(part) for part in value.split(self._separator))
+        except ValueError:
+            a = b = math.nan
+        if not all(abs(number) <= 1000 for number in (a, b)):
+            self.fail(f"'{value}' is not two numbers such as {self._example}", param, ctx)
+        return a, b
+
+
+@study.command(short_help="Draw a plan: orders, spots, letters; and its key.")
+@click.option("--participants", type=click.IntRange(1, 1000), default=20, help="Number of participants.")
+@click.option(
+    "--policy",
+    "policies",
+    multiple=True,
+    type=click.Choice(POLICY_NAMES),
+    help="A condition; 2 to 8 of them.  [default: the paper's: share, covins-g, linear, equal]",
+)
+@click.option(
+    "--space", type=_Numbers("x", "4x4"), default="4x4", metavar="WxD", help="Size of the floor, m."
+)
+@click.option(
+    "--corner", type=_Numbers(",", "-2,-2"), default="0,0", metavar="X,Y", help="Its least x and y, m."
+)
+@click.option("--spots", type=click.IntRange(1, 200), default=10, help="Spots to draw.")
+@click.option("--margin", type=_Amount(0, 100), default=0.5, help="From the edge of the floor, m.")
+@click.option("--apart", type=_Amount(0, 100), default=0.8, help="Spots from each other, m.")
+@click.option(
+    "--spots-file",
+    metavar="FILE",
+    type=options.EXISTING_FILE,
+    help="Spots of your own: CSV x,y or YAML `spots`.",
+)
+@click.option(
+    "--path-file",
+    metavar="FILE",
+    type=options.EXISTING_FILE,
+    help="The researcher's path: CSV x,y or YAML `path`.  [default: a loop within the margin]",
+)
+@click.option(
+    "--questions", metavar="FILE", type=options.EXISTING_FILE, help="Questions of your own, YAML `questions`."
+)
+@click.option("--distance", type=_Amount(0.01, 100), default=0.5, help="Of success, m.")
+@click.option("--timeout", type=_Amount(0.1, 3600), default=30.0, help="Of success, s.")
+@click.option("--seed", type=click.IntRange(0, 2**63), help="Of the whole plan.  [default: drawn]")
+@click.option(
+    "--key", "key_file", metavar="FILE", type=options.PATH, help="The key.  [default: DIR-key.json]"
+)
+@options.out_folder
+@options.explain_policies
+def plan(
+    participants: int,
+    policies: tuple[str, ...],
+    space: tuple[float, float],
+    corner: tuple[float, float],
+    spots: int,
+    margin: float,
+    apart: float,
+    spots_file: Path | None,
+    path_file: Path | None,
+    questions: Path | None,
+    distance: float,
+    timeout: float,
+    seed: int | None,
+    key_file: Path | None,
+    out: Path,
+) -> None:
+    """Draw who meets which condition when, by letters, and write the key to the letters to a file apart.
+
+    Orders are balanced for place and carry-over; each trial has an order of its spots of its own. DIR gets
+    plan.json. Whoever is to stay blind must not see the key, nor --seed, which tells it; nothing is ever
+    overwritten.
+
+    \b
+    Example:  share study plan --participants 20 --out study
+    """
+    import numpy as np
+
+    from share.lab.study.plan import (
+        PAPER_POLICIES,
+        PLAN,
+        QUESTIONS,
+        PlanWishes,
+        SuccessRule,
+        draw_plan,
+        read_questions,
+    )
+    from share.lab.study.spots import Space, draw_spots, loop_path, read_points
+
+    floor = Space(*space, *corner)
+    if min(space) <= 0:
+        raise UsageError(f"--space {space[0]:g}x{space[1]:g}: both must be positive")
+    plan_path, key_path = out / PLAN, key_file or out.with_name(f"{out.name}-key.json")
+    for path in (plan_path, key_path):
+        if path.exists():
+            raise UsageError(f"{path}: exists and is not overwritten; give a new --out or --key")
+    if key_path.resolve().is_relative_to(out.resolve()):
+        raise UsageError(f"--key {key_path}: lies beside the plan; give a name outside of {out}")
+    drawn_seed = secrets.randbits(63) if seed is None else seed
+    wishes = PlanWishes(
+        participants,
+        policies or PAPER_POLICIES,
+        draw_spots(floor, spots, margin, apart, np.random.default_rng([drawn_seed, 1]))
+        if spots_file is None
+        else read_points(spots_file, "spots", 1, floor),
+        loop_path(floor, margin) if path_file is None else read_points(path_file, "path", 2, floor),
+        SuccessRule(distance, timeout),
+        QUESTIONS if questions is None else read_questions(questions),
+    )
+    drawn, key = draw_plan(wishes, drawn_seed, secrets.token_hex(16))
+    _write_plan(plan_path, key_path, drawn, key.text())
+    for line in drawn.balance.lines(list(drawn.letters)):
+        click.echo(line)
+    click.echo(
+        f"plan: {plan_path} (letters only); key: {key_path} (give it to somebody who is not in the room)"
+    )
+
+
+def _write_plan(plan_path: Path, key_path: Path, plan: StudyPlan, key_text: str) -> None:
+    """Write both files, or none."""
+    from share.files.writing import check_writable, new_file, write_private
+    from share.lab.study.plan import plan_text
+
+    check_writable(plan_path)
+    write_private(check_writable(key_path), key_text)
+    try:
+        with new_file(plan_path) as file:
+            file.write(plan_text(plan).encode())
+    except BaseException:
+        key_path.unlink(missing_ok=True)  # ours, of a plan that does not exist
+        raise
+
+
+@study.command(short_help="Tell the policies behind the letters, once all trials are done.")
+@click.argument("folder", type=options.PATH)
+@click.option("--key", "key_file", metavar="FILE", required=True, type=options.PATH, help="The plan's key.")
+@click.option("--early", is_flag=True, help="Although trials are missing; this is recorded.")
+def unblind(folder: Path, key_file: Path, early: bool) -> None:
+    """Write the policies behind the letters to FOLDER/unblinded.json, for `share study analyze`.
+
+    Refused while trials of the plan are missing, since a study is not blind any more then.
+
+    \b
+    Example:  share study unblind study --key study-key.json
+    """
+    from share.files.writing import new_file
+    from share.lab.study.plan import UNBLINDED, Unblinding, read_key, read_plan, renamed, unblinding_text
+    from share.lab.study.trials import read_trials
+
+    plan = read_plan(folder)
+    key = read_key(key_file, plan)
+    policies = renamed(plan.letters, key.policies, str(key_file))
+    planned = len(plan.participants) * len(plan.letters)
+    done = sum(record.is_complete for record in read_trials(folder, plan).values())
+    if done < planned and not early:
+        raise UsageError(
+            f"{folder}: {done} of {planned} trials are done; unblinding now ends the blindness of the "
+            "others; finish them, or give --early, which is recorded"
+        )
+    when = datetime.now(UTC).isoformat(timespec="seconds")
+    content = Unblinding(key, when, done, planned, done < planned)
+    with new_file(folder / UNBLINDED) as file:
+        file.write(unblinding_text(content).encode())
+    for letter, policy in policies.items():
+        click.echo(f"{letter}  {policy}")
+
+
+@study.command(short_help="Compute a study's statistics.")
+@click.argument("data", metavar="FOLDER|CSV", type=click.Path(path_type=Path, exists=True))
+@click.option(
+    "--key", "key_file", metavar="FILE", type=options.PATH, help="The key: policies in place of letters."
+)
+@click.option(
+    "--preferences",
+    metavar="FILE",
+    type=options.EXISTING_FILE,
+    help="With a CSV: CSV participant,most,least.",
+)
+@click.option(
+    "--range",
+    "ranges",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="With a CSV: the range of a measure, beyond which a value is an error; may be repeated.",
+)
+@click.option("--distance", type=_Amount(0.01, 100), help="Of success, m.  [default: the plan's]")
+@click.option("--timeout", type=_Amount(0.1, 3600), help="Of success, s.  [default: the plan's]")
+@click.option("--out", metavar="DIR", type=options.PATH, help="Folder for the report.")
+@options.as_json
+def analyze(
+    data: Path,
+    key_file: Path | None,
+    preferences: Path | None,
+    ranges: tuple[str, ...],
+    distance: float | None,
+    timeout: float | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Compute the statistics of a study: of FOLDER, planned by `share study plan`, or of a CSV file with
+    participant, condition, place (its number in the participant's order) and a column for each measure.
+
+    By letters, until `share study unblind` or with --key. DIR gets report.html (opens offline), report.md,
+    descriptives.csv, tests.csv, pairs.csv, tables.tex (LaTeX), study.png, preferences.png.
+
+    \b
+    Example:  share study analyze study --out report
+              share study analyze ratings.csv --range rating=1:10 --out report
+    """
+    from share.files.json_file import nan_to_none
+    from share.files.writing import writable_dir
+    from share.lab.study.study_analysis import analyse
+    from share.lab.study.study_report import FILES, write_report
+    from share.lab.study.study_tables import coverage_lines, rule_line
+
+    if out is not None:
+        writable_dir(out, *FILES)
+    if data.is_dir():
+        _refuse(preferences is not None or bool(ranges), "--preferences and --range are for a CSV file")
+        table, rule = _study_table(data, key_file, distance, timeout)
+    else:
+        _refuse(distance is not None or timeout is not None, "--distance and --timeout are for a FOLDER")
+        table, rule = _csv_table(data, key_file, preferences, ranges), None
+    found = analyse(table)
+    files = [] if out is None else write_report(found, table, rule, out)
+    if as_json:
+        success = None if rule is None else asdict(rule)
+        click.echo(json.dumps(nan_to_none({"success": success} | _plain(asdict(found)))))
+        return
+    for line in [*coverage_lines(found), *([] if rule is None else [rule_line(rule)])]:
+        click.echo(f"* {line}")
+    _print_tables(found)
+    if files:
+        click.echo(f"report: {', '.join(map(str, files))}")
+
+
+def _print_tables(found: StudyAnalysis) -> None:
+    from share.cli.terminal import aligned_table
+    from share.lab.study.study_tables import choice_rows, differing_rows, order_rows, overview_rows
+
+    differing = differing_rows(found)
+    compared = sum(len(measure.pairs) for measure in found.measures)
+    for title, rows in (
+        ("means and tests", overview_rows(found)),
+        (f"pairs with Holm's p below 0.05: {len(differing) - 1} of {compared}", differing),
+        ("order and learning", order_rows(found)),
+        ("preferences", choice_rows(found)),
+    ):
+        if len(rows) > 1:
+            click.echo(f"\n{title}\n{aligned_table(rows)}")
+    click.echo()
+
+
+def _plain(value: Any) -> Any:
+    """Return nested data with arrays as lists."""
+    import numpy as np
+
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _refuse(is_wrong: bool, text: str) -> None:
+    if is_wrong:
+        raise UsageError(text)
+
+
+def _study_table(
+    folder: Path, key_file: Path | None, distance: float | None, timeout: float | None
+) -> tuple[Observations, SuccessRule]:
+    from share.lab.study.observations import read_study
+    from share.lab.study.plan import SuccessRule, read_key, read_plan, read_unblinding, renamed
+
+    plan = read_plan(folder)
+    rule = SuccessRule(distance or plan.success.distance_m, timeout or plan.success.timeout_s)
+    table = read_study(folder, plan, rule)
+    unblinding = read_unblinding(folder, plan)
+    if unblinding is not None:
+        if unblinding.early:
+            early = f"unblinded early, with {unblinding.done} of {unblinding.planned} trials done"
+            print_note(str(folder), early)
+            table = table.with_note(early)
+        return table.named(renamed(plan.letters, unblinding.key.policies, str(folder))), rule
+    if key_file is None:
+        return table, rule
+    policies = renamed(plan.letters, read_key(key_file, plan).policies, str(key_file))
+    if table.done < table.planned:
+        raise UsageError(
+            f"--key: {table.done} of {table.planned} trials are done, and the study is blind; leave --key "
+            "out for statistics by letters, or end its blindness with `share study unblind --early`"
+        )
+    return table.named(policies), rule
+
+
+def _csv_table(
+    path: Path, key_file: Path | None, preferences: Path | None, ranges: tuple[str, ...]
+) -> Observations:
+    from share.lab.study.observations import read_table
+    from share.lab.study.plan import read_key, renamed
+
+    limits = {}
+    for text in ranges:
+        match = re.fullmatch(r"(.+)=(-?[\d.]+):(-?[\d.]+)", text)
+        if match is None or not _float(match[2]) < _float(match[3]):
+            raise UsageError(f"--range '{text}' is not NAME=LOW:HIGH, such as rating=1:10")
+        limits[match[1]] = _float(match[2]), _float(match[3])
+    table = read_table(path, limits, preferences)
+    if key_file is None:
+        return table
+    return table.named(renamed(table.conditions, read_key(key_file, None).policies, str(key_file)))
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

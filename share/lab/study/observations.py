@@ -1,0 +1,290 @@
+"""The table that is analysed: one value of each measure for each participant and condition."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.config import POLICY_NAMES
+from share.errors import DataError
+from share.files.json_file import own_format_errors, read_json_lines
+from share.files.reading import MAX_REPORT_BYTES, read_errors, read_text
+from share.lab.study.orders import MAX_CONDITIONS, MIN_CONDITIONS
+from share.lab.study.plan import ANSWERS, MAX_PARTICIPANTS, StudyPlan, SuccessRule
+from share.lab.study.trials import TRIAL_MEASURES, read_trials, trial_measures
+from share.types import F64, I64
+
+_HEAD = ("participant", "condition", "place")
+_CHOICES = ("most", "least")
+Ranges = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """measures: {name: (P, C)}, NaN where missing. places (P, C): from 1, 0 where unknown. choices:
+    {"most" | "least": condition that each participant named, "" where none}. notes: what a reader must know
+    of the data."""
+
+    participants: tuple[str, ...]
+    conditions: tuple[str, ...]
+    measures: dict[str, F64]
+    places: I64
+    choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    planned: int = 0  # trials; 0 where no plan is known
+    done: int = 0
+
+    def named(self, names: Mapping[str, str]) -> Observations:
+        """Return the table with policies in place of letters, in their usual order."""
+        named = [names[one] for one in self.conditions]
+        order = sorted(range(len(named)), key=lambda k: POLICY_NAMES.index(named[k]))
+        return replace(
+            self,
+            conditions=tuple(named[k] for k in order),
+            measures={name: values[:, order] for name, values in self.measures.items()},
+            places=self.places[:, order],
+            choices={kind: tuple(names.get(one, "") for one in ones) for kind, ones in self.choices.items()},
+        )
+
+    def with_note(self, note: str) -> Observations:
+        """Return the table with one more note."""
+        return replace(self, notes=(*self.notes, note))
+
+
+def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
+    """Read the trials and answers of a study's folder. Raises DataError that names file and line."""
+    people = [one.name for one in plan.participants]
+    shape = len(people), len(plan.letters)
+    places = np.zeros(shape, np.int64)
+    measures = {name: np.full(shape, math.nan) for name in TRIAL_MEASURES}
+    records = read_trials(study, plan)
+    statuses: Counter[str] = Counter()
+    for (name, place), record in records.items():
+        cell = people.index(name), plan.letters.index(record.condition)
+        places[cell] = place
+        if record.is_complete:
+            statuses.update(goal.status for goal in record.goals.values())
+            for measure, value in trial_measures(record.goals.values(), rule).items():
+                measures[measure][cell] = value
+    answers, choices = _read_answers(study / ANSWERS, plan)
+    judges = sorted({record.judge for record in records.values()})
+    done = sum(record.is_complete for record in records.values())
+    notes = (*_broken_note(records), *_judge_notes(judges, statuses))
+    return Observations(
+        tuple(people), plan.letters, measures | answers, places, choices, notes, places.size, done
+    )
+
+
+def _broken_note(records: Mapping[tuple[str, int], Any]) -> Iterable[str]:
+    broken = [f"{name} place {place}" for (name, place), one in records.items() if not one.is_complete]
+    if broken:
+        names = ", ".join(broken)
+        yield f"{len(broken)} trials were begun and not carried through; their goals are left out: {names}"
+
+
+def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable[str]:
+    if "map" in judges:
+        yield (
+            "reachability is judged by the map itself (no motion capture), which favours policies under "
+            "which headset and robot drift together"
+        )
+    if statuses:
+        yield "the navigator's own status of goals: " + ", ".join(
+            f"{name} {count}" for name, count in sorted(statuses.items())
+        )
+
+
+def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str, tuple[str, ...]]]:
+    """Read answers after trials (P, C) by question, and most and least preferred conditions."""
+    people = {one.name: k for k, one in enumerate(plan.participants)}
+    letters = {letter: k for k, letter in enumerate(plan.letters)}
+    table = {one.name: np.full((len(people), len(letters)), math.nan) for one in plan.questions}
+    choices = {kind: [""] * len(people) for kind in _CHOICES}
+    for number, row in enumerate(read_json_lines(path) if path.exists() else [], 1):
+        where = f"{path}, line {number}"
+        with own_format_errors(Path(where)):
+            person = row["participant"]
+            if person not in people:
+                raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
+            if "answers" in row:
+                _put_answers(
+                    table,
+                    row,
+                    plan,
+                    (people[person], letters[_known_letter(row["condition"], letters, where)]),
+                    where,
+                )
+            for kind in _CHOICES:
+                if kind in row:
+                    if choices[kind][people[person]]:
+                        raise DataError(f"{where}: {person} has said before which is {kind} preferred")
+                    choices[kind][people[person]] = _known_letter(row[kind], letters, where)
+    given = {kind: tuple(ones) for kind, ones in choices.items() if any(ones)}
+    return {name: values for name, values in table.items() if np.isfinite(values).any()}, given
+
+
+def _known_letter(letter: Any, letters: Mapping[str, int], where: str) -> str:
+    if letter not in letters:
+        raise DataError(f"{where}: condition {letter!s:.40} is not in the plan")
+    return str(letter)
+
+
+def _put_answers(
+    table: Mapping[str, F64], row: Mapping[str, Any], plan: StudyPlan, cell: tuple[int, int], where: str
+) -> None:
+    questions = {one.name: one for one in plan.questions}
+    for name, value in row["answers"].items():
+        if name not in questions:
+            raise DataError(f"{where}: question {name!s:.40} is not in the plan")
+        if value is None:  # not answered
+            continue
+        asked = questions[name]
+        if type(value) is not int or not asked.least <= value <= asked.greatest:
+            raise DataError(
+                f"{where}: {name}: {value!s:.40} is not a whole number from {asked.least} to {asked.greatest}"
+            )
+        if not math.isnan(table[name][cell]):
+            raise DataError(f"{where}: {row['participant']} has answered {name} of {row['condition']} before")
+        table[name][cell] = value
+
+
+def read_table(path: Path, ranges: Ranges, choices_file: Path | None) -> Observations:
+    """Read a CSV file: participant, condition, place (from 1, or empty), then a column for each measure.
+
+    An empty cell is missing. Raises DataError that names the line.
+    """
+    lines = _csv_lines(path)
+    head = [name.strip() for name in lines[0][1]]
+    is_named = all(name and name.isprintable() for name in head)
+    if tuple(head[:3]) != _HEAD or len(head) < 4 or len(set(head)) < len(head) or not is_named:
+        raise DataError(
+            f"{path}: its first line must be participant,condition,place and a name for each measure, each "
+            f"once"
+        )
+    for name in ranges:
+        if name not in head[3:]:
+            raise DataError(f"--range {name}: {path} has no such measure; it has {', '.join(head[3:])}")
+    rows = [_CsvRow.read(f"{path}, line {number}", head, cells) for number, cells in lines[1:]]
+    people, conditions = (
+        tuple(sorted({getattr(row, name) for row in rows})) for name in ("participant", "condition")
+    )
+    if not MIN_CONDITIONS <= len(conditions) <= MAX_CONDITIONS or len(people) > MAX_PARTICIPANTS:
+        raise DataError(
+            f"{path}: {len(people)} participants and {len(conditions)} conditions; at most "
+            f"{MAX_PARTICIPANTS}, and {MIN_CONDITIONS} to {MAX_CONDITIONS}, can be analysed"
+        )
+    shape = len(people), len(conditions)
+    places = np.zeros(shape, np.int64)
+    measures = {name: np.full(shape, math.nan) for name in head[3:]}
+    seen: dict[tuple[str, str], str] = {}
+    for row in rows:
+        row.check(seen, len(conditions), ranges)
+        cell = people.index(row.participant), conditions.index(row.condition)
+        places[cell] = row.place
+        for name, value in row.values.items():
+            measures[name][cell] = value
+    choices = {} if choices_file is None else _read_choices(choices_file, people, conditions)
+    done = int(sum(np.isfinite(list(measures.values())).any(axis=0).ravel()))
+    return Observations(people, conditions, measures, places, choices, planned=places.size, done=done)
+
+
+def _csv_lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the lines that are not empty, with their numbers; at least two."""
+    with read_errors(path):
+        text = read_text(path, MAX_REPORT_BYTES, "utf-8-sig")
+    try:
+        reader = csv.reader(io.StringIO(text), strict=True)
+        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise DataError(f"{path}: is not CSV: {error}") from None
+    if len(lines) < 2:
+        raise DataError(f"{path}: has no line of data below a line of names")
+    return lines
+
+
+@dataclass(frozen=True)
+class _CsvRow:
+    where: str
+    participant: str
+    condition: str
+    place: int
+    values: dict[str, float]
+
+    @staticmethod
+    def read(where: str, head: Sequence[str], cells: Sequence[str]) -> _CsvRow:
+        if len(cells) != len(head):
+            raise DataError(f"{where}: {len(cells)} cells; {len(head)} are wanted")
+        participant, condition, place, *values = (cell.strip() for cell in cells)
+        if not all(name and name.isprintable() for name in (participant, condition)):
+            raise DataError(f"{where}: participant or condition is empty, or not printable")
+        if place and not place.isdecimal():
+            raise DataError(f"{where}: place '{place:.40}' is not a whole number from 1")
+        numbers = {name: _number(cell, name, where) for name, cell in zip(head[3:], values, strict=True)}
+        return _CsvRow(where, participant, condition, int(place[:6] or 0), numbers)
+
+    def check(self, seen: dict[tuple[str, str], str], conditions: int, ranges: Ranges) -> None:
+        """Raise DataError for a participant twice in a condition or a place, or a value out of its range."""
+        keys = [(self.participant, f"condition {self.condition}")]
+        if self.place:
+            keys.append((self.participant, f"place {self.place}"))
+        if self.place > conditions:
+            raise DataError(f"{self.where}: place {self.place}, where there are {conditions} conditions")
+        for key in keys:
+            if key in seen:
+                raise DataError(
+                    f"{self.where}: participant {key[0]} has {key[1]} a second time, first in {seen[key]}"
+                )
+            seen[key] = self.where.rpartition(", ")[2]
+        for name, (low, high) in ranges.items():
+            if self.values[name] < low or self.values[name] > high:
+                raise DataError(f"{self.where}: {name} {self.values[name]:g} is outside {low:g} to {high:g}")
+
+
+def _number(cell: str, name: str, where: str) -> float:
+    if not cell:
+        return math.nan
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < 1e9:
+        raise DataError(
+            f"{where}: {name}: '{cell:.40}' is not a number; leave the cell empty if it is missing"
+        )
+    return value
+
+
+def _read_choices(path: Path, people: Sequence[str], conditions: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Read a CSV file with participant, most, least."""
+    lines = _csv_lines(path)
+    if [name.strip() for name in lines[0][1]] != ["participant", *_CHOICES]:
+        raise DataError(f"{path}: its first line must be participant,most,least")
+    chosen: dict[str, Sequence[str]] = {}
+    for number, cells in lines[1:]:
+        where = f"{path}, line {number}"
+        person, *named = (cell.strip() for cell in cells)
+        if person not in people or person in chosen or len(named) != 2:
+            reason = (
+                "comes twice"
+                if person in chosen
+                else "has no trial"
+                if len(named) == 2
+                else "needs two more cells"
+            )
+            raise DataError(f"{where}: participant {person:.40} {reason}")
+        for one in named:
+            if one and one not in conditions:
+                raise DataError(f"{where}: condition {one:.40} is not among {', '.join(conditions)}")
+        chosen[person] = named
+    return {
+        kind: tuple(chosen[person][k] if person in chosen else "" for person in people)
+        for k, kind in enumerate(_CHOICES)
+    }

@@ -1,0 +1,231 @@
+"""What a trial leaves behind: `trials/PARTICIPANT-PLACE/events.jsonl`; whether the robot came.
+
+Times are seconds on one monotonic clock of the trial, positions x, y in m in one frame: of the motion capture
+where it judges, else of the map. A goal that is called again, after an interruption, begins anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.errors import DataError
+from share.files.json_file import own_format_errors, read_json_lines
+from share.lab.study.plan import TRIALS, StudyPlan, SuccessRule
+from share.robot.settings import CREATE3_SPEED_M_S
+
+EVENTS = "events.jsonl"
+JUDGES = ("mocap", "map")
+
+
+@dataclass(frozen=True)
+class RobotStop:
+    """The robot stands. s: after the call; distance_m: to the cube; path_m: driven since the call."""
+
+    s: float
+    distance_m: float
+    path_m: float
+
+
+@dataclass
+class CalledGoal:
+    """One call of the robot. straight_m: from the robot to the cube at the call; planned_m: the way there, as
+    planned, or straight_m."""
+
+    spot: int
+    called_s: float
+    cube: tuple[float, float]
+    straight_m: float
+    planned_m: float
+    first_motion_s: float = math.nan
+    stops: list[RobotStop] = field(default_factory=list)
+    status: str = "none"  # the navigator's own
+
+    def timeout_s(self, rule: SuccessRule, longer: bool) -> float:
+        """Return the time allowed; longer: with the time that the way takes at the robot's top speed."""
+        return rule.timeout_s + (self.planned_m / CREATE3_SPEED_M_S if longer else 0.0)
+
+    def reached_s(self, rule: SuccessRule, longer: bool = False) -> float:
+        """Return after how long the robot stood close enough; NaN if it did not in time."""
+        limit_s = self.timeout_s(rule, longer)
+        times = [one.s for one in self.stops if one.distance_m <= rule.distance_m and one.s <= limit_s]
+        return min(times, default=math.nan)
+
+
+@dataclass
+class TrialRecord:
+    """What happened in a trial. is_complete: it was carried through."""
+
+    condition: str
+    judge: str
+    goals: dict[int, CalledGoal]  # by number, from 1
+    is_complete: bool
+
+
+def trial_folder(study: Path, participant: str, place: int) -> Path:
+    """Return where a trial is; place: from 1."""
+    return study / TRIALS / f"{participant}-{place}"
+
+
+def read_trials(study: Path, plan: StudyPlan) -> dict[tuple[str, int], TrialRecord]:
+    """Return the trials that there are, by participant and place. Raises DataError."""
+    planned = {
+        trial_folder(study, one.name, place).name: (one.name, place, trial.condition)
+        for one in plan.participants
+        for place, trial in enumerate(one.trials, 1)
+    }
+    folder = study / TRIALS
+    there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    for name in there:
+        if name not in planned and not name.startswith("."):
+            raise DataError(f"{folder / name}: the plan has no such trial; move it elsewhere")
+    records = {}
+    for name, (participant, place, condition) in planned.items():
+        path = folder / name / EVENTS
+        if path.exists():
+            records[participant, place] = read_trial(path, plan, participant, place, condition)
+    return records
+
+
+def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condition: str) -> TrialRecord:
+    """Read the events of one trial, which must be the planned one. Raises DataError."""
+    record = TrialRecord(condition, "", {}, False)
+    wanted = {"participant": participant, "place": place, "condition": condition, "plan": plan.digest}
+    for number, event in enumerate(read_json_lines(path), 1):
+        where = f"{path}, line {number}"
+        with own_format_errors(Path(where)):
+            kind = event["event"]
+            if kind == "begin":
+                _check_begin(event, wanted, where)
+                record.judge = event["judge"]
+            elif not record.judge:
+                raise DataError(f"{where}: {kind} before begin")
+            elif kind in _READERS:
+                _READERS[kind](record, event, plan)
+            else:
+                raise DataError(f"{where}: event '{kind!s:.40}' is not known")
+    if record.is_complete and len(record.goals) != len(plan.spots):
+        raise DataError(
+            f"{path}: says that it is complete, with {len(record.goals)} of {len(plan.spots)} goals"
+        )
+    return record
+
+
+def _check_begin(event: Mapping[str, Any], wanted: Mapping[str, Any], where: str) -> None:
+    for name, value in wanted.items():
+        if event[name] != value:
+            what = "another plan" if name == "plan" else f"{name} {event[name]!s:.40}, not {value}"
+            raise DataError(f"{where}: the trial was run by {what}; put it where it belongs")
+    if event["judge"] not in JUDGES:
+        raise DataError(f"{where}: judge '{event['judge']!s:.40}'; known: {', '.join(JUDGES)}")
+
+
+def _read_call(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    cube, robot = (_position(event[name]) for name in ("cube_m", "robot_m"))
+    straight_m = math.dist(cube, robot)
+    goal = CalledGoal(
+        int(event["spot"]), _number(event["t_s"]), cube, straight_m, _number(event.get("path_m", straight_m))
+    )
+    number = int(event["goal"])
+    if not (1 <= number <= len(plan.spots) and 1 <= goal.spot <= len(plan.spots)):
+        raise ValueError(f"goal {number} at spot {goal.spot}; the plan has {len(plan.spots)} of each")
+    record.goals[number] = goal
+
+
+def _read_moves(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    goal = record.goals[event["goal"]]
+    if math.isnan(goal.first_motion_s):
+        goal.first_motion_s = _since_call(goal, event)
+
+
+def _read_stands(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    goal = record.goals[event["goal"]]
+    distance_m = math.dist(goal.cube, _position(event["robot_m"]))
+    goal.stops.append(RobotStop(_since_call(goal, event), distance_m, _number(event["path_m"])))
+
+
+def _read_status(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    record.goals[event["goal"]].status = str(event["status"])
+
+
+def _read_end(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    record.is_complete = True
+
+
+def _read_interruption(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    str(event["reason"])
+
+
+_READERS: dict[str, Callable[[TrialRecord, Mapping[str, Any], StudyPlan], None]] = {
+    "call": _read_call,
+    "moves": _read_moves,
+    "stands": _read_stands,
+    "status": _read_status,
+    "interrupted": _read_interruption,
+    "end": _read_end,
+}
+EVENT_KINDS = ("begin", *_READERS)
+
+
+def _position(value: Sequence[Any]) -> tuple[float, float]:
+    x, y = value
+    return _number(x), _number(y)
+
+
+def _number(value: Any) -> float:
+    if type(value) not in (int, float):
+        raise TypeError(f"{value!r:.40} is not a number")
+    return float(value)
+
+
+def _since_call(goal: CalledGoal, event: Mapping[str, Any]) -> float:
+    s = _number(event["t_s"]) - goal.called_s
+    if s < 0:
+        raise ValueError(f"t_s {event['t_s']} is before the call at {goal.called_s}")
+    return s
+
+
+REACHED, REACHED_LONGER = "reachability, %", "reachability with the longer time-out, %"
+# what is measured of each trial; the first two by the rule of success
+TRIAL_MEASURES = (
+    REACHED,
+    REACHED_LONGER,
+    "time until the robot stands there, s",
+    "time to first motion, s",
+    "path over straight line",
+    "final distance, m",
+)
+
+
+def trial_measures(goals: Iterable[CalledGoal], rule: SuccessRule) -> dict[str, float]:
+    """Return the measures of a complete trial: means over its goals; of times over the goals that have one.
+
+    path over straight line: sums over reached goals. final distance: at the last stop, of goals with one.
+    """
+    called = list(goals)
+    times, longer = (np.array([one.reached_s(rule, long) for one in called]) for long in (False, True))
+    reached = [
+        (next(stop.path_m for stop in goal.stops if stop.s == s), goal.straight_m)
+        for goal, s in zip(called, times.tolist(), strict=True)
+        if not math.isnan(s)
+    ]
+    driven, straight = (sum(one[k] for one in reached) for k in (0, 1))
+    values = (
+        100 * float(np.isfinite(times).mean()),
+        100 * float(np.isfinite(longer).mean()),
+        _known_mean(times.tolist()),
+        _known_mean(one.first_motion_s for one in called),
+        driven / straight if straight else math.nan,
+        _known_mean(one.stops[-1].distance_m for one in called if one.stops),
+    )
+    return dict(zip(TRIAL_MEASURES, values, strict=True))
+
+
+def _known_mean(values: Iterable[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
