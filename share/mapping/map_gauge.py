@@ -23,8 +23,8 @@ from share.geometry import se3
 from share.mapping.localisation_gate import AHEAD_M
 from share.types import F64
 
-# How far from the solution an agent stays: its sigma, and at most so far, since two agents may be surer of each
-# other than of where they are in the map.
+# How far from the solution an agent stays: its sigma, and at most so far, since two agents may be surer of
+# each other than of where they are in the map.
 _MAX_SLACK_M = 0.005
 
 
