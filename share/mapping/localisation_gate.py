@@ -18,7 +18,8 @@ from share.geometry import se3
 from share.types import F64
 
 PATIENCE = 20  # keyframes with loops after which agents enter another map however uncertain
-_WIDENS_AFTER = 4  # keyframes with loops; with n times as many, n times the sigma is enough
+_WIDENS_AFTER = 8  # keyframes with loops; with n times as many, n times the sigma is enough
+ROBOT_SHARE = 0.4  # of the sigma that is enough for a wearer: a robot's odometry is surer, and can wait
 AHEAD_M = 3.0  # what a wearer or robot looks at; a rotation moves it by this lever
 
 
@@ -32,19 +33,21 @@ class PlacementUncertainty:
     """Uncertainty of an agent's pose in a map.
 
     cov (6, 6): of T_map_odom. sigma_m: `sigma_ahead` of the body's pose. answered_id: the agent's keyframe
-    with a loop that is new in this solution, or None.
+    with a loop that is new in this solution, or None. is_worn: by somebody who waits to share the map.
     """
 
     cov: F64
     sigma_m: float
     answered_id: int | None = None
+    is_worn: bool = True
 
 
 class LocalisationGate:
     """State of the gate for each segment. Segments and reference segments are given by their indices."""
 
     def __init__(self, enter_m: float) -> None:
-        """enter_m: sigma at which agents enter another map, at the latest after `PATIENCE` keyframes."""
+        """enter_m: sigma at which wearers enter another map, at the latest after `PATIENCE` keyframes; robots
+        at a smaller one."""
         self._enter_m = enter_m
         # By segment: reference segment of the published map, and the covariance there.
         self._published: dict[int, tuple[int, F64 | None]] = {}
@@ -110,4 +113,6 @@ class LocalisationGate:
         waited = self._waited.setdefault((previous_map, reference_segment), set())
         waited.update((s, key) for s in entering if (key := uncertainties[s].answered_id) is not None)
         enough_m = self._enter_m * max(1.0, len(waited) / _WIDENS_AFTER)
+        if not any(uncertainties[s].is_worn for s in entering):
+            enough_m *= ROBOT_SHARE
         return max(uncertainties[s].sigma_m for s in entering) > enough_m and len(waited) <= PATIENCE

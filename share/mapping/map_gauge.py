@@ -6,6 +6,10 @@ all would see it move, though nothing changes between them. So the frame that is
 which the map is solved: a solution is put where it moves those in it least, the surest odometry least of all
 (as the inner constraints of a free network do; Meissl, 1969). But no further off than the place of the surest
 agent is uncertain: a drift that is known is corrected, for all alike.
+
+So it is with each agent. Over seconds its odometry is surer than the map, so an agent stays where it was
+shown while the solution is so near that it may as well be the solution that is wrong; else it is led there
+only until it is so near.
 """
 
 from __future__ import annotations
@@ -18,6 +22,10 @@ import numpy as np
 from share.geometry import se3
 from share.mapping.localisation_gate import AHEAD_M
 from share.types import F64
+
+# How far from the solution an agent stays: its sigma, and at most so far, since two agents may be surer of
+# each other than of where they are in the map.
+_MAX_SLACK_M = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +55,31 @@ class MapGauge:
 
     def show(self, reference_segment: int, places: Mapping[int, SolvedPlace]) -> dict[int, F64]:
         """Return T_map_odom (4, 4) to show to each segment of a map, for places as solved."""
-        known = [s for s in places if self._published.get(s, (None,))[0] == reference_segment]
+        known = {s: self._published[s][1] for s in places if self._is_shown(s, reference_segment)}
         T_published_map = np.eye(4)
         if known:
-            T_published_map = _gauge([places[s] for s in known], [self._published[s][1] for s in known])
+            T_published_map = _gauge([places[s] for s in known], list(known.values()))
         T_map_odom = np.array([place.T_map_odom for place in places.values()]).reshape(-1, 4, 4)
         published = dict(zip(places, se3.orthonormal(T_published_map @ T_map_odom), strict=True))
+        published |= {s: _led(places[s], before, published[s]) for s, before in known.items()}
         self._published |= {s: (reference_segment, T) for s, T in published.items()}
         return published
+
+    def _is_shown(self, segment: int, reference_segment: int) -> bool:
+        return self._published.get(segment, (None,))[0] == reference_segment
+
+
+def _led(place: SolvedPlace, before: F64, solved: F64) -> F64:
+    """Return T_map_odom (4, 4) between two of them: where an agent was shown before, and where it is."""
+    way = se3.log(se3.inverse(before @ place.T_odom_body) @ solved @ place.T_odom_body)
+    slack_m = min(place.sigma_m, _MAX_SLACK_M)
+    share = max(0.0, 1 - slack_m / max(_length_m(way), 1e-12))
+    return se3.orthonormal(before @ place.T_odom_body @ se3.exp(share * way) @ se3.inverse(place.T_odom_body))
+
+
+def _length_m(way: F64) -> float:
+    """Return by how much a motion (6,) of a body moves the body and what is ahead of it, at most."""
+    return float(np.linalg.norm(way[3:]) + AHEAD_M * np.linalg.norm(way[:3]))
 
 
 def _gauge(places: list[SolvedPlace], published: list[F64]) -> F64:
@@ -66,9 +91,8 @@ def _gauge(places: list[SolvedPlace], published: list[F64]) -> F64:
     T = _least_motion(solved_body, published_body, weights / weights.sum())
     about = se3.from_rt(np.eye(3), solved_body[:, :3, 3].mean(axis=0))
     way = se3.log(se3.inverse(about) @ T @ about)
-    length_m = float(np.linalg.norm(way[3:]) + AHEAD_M * np.linalg.norm(way[:3]))
     most_m = min(place.sigma_m for place in places)
-    return about @ se3.exp(way * min(1.0, most_m / max(length_m, 1e-12))) @ se3.inverse(about)
+    return about @ se3.exp(way * min(1.0, most_m / max(_length_m(way), 1e-12))) @ se3.inverse(about)
 
 
 def _least_motion(poses: F64, goals: F64, weights: F64) -> F64:

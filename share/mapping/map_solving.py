@@ -202,6 +202,7 @@ class MapSolving:
                 se3.inverse_cov(nodes[last].T_odom_body, covariances[last]),
                 sigma_ahead(covariances[last]),
                 answered_ids.get(odometry.segments[segment].agent),
+                odometry.segments[segment].is_worn,
             )
             for segment, last in zip(job.segments, job.newest_nodes, strict=True)
             if last in covariances and last in nodes

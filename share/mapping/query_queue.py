@@ -60,7 +60,7 @@ def service_kind(config: Config, hello: Hello) -> AgentKind:
 
 
 def map_rank(config: Config, hello: Hello | None, is_reference: bool = False) -> int:
-    """Rank of a new segment: lower ranks keep their map in a merge.
+    """Rank of a new segment: lower ranks keep their map in a merge; even ranks are headsets'.
 
     Headsets' maps stay, as their wearers would notice a jump; restored maps come first. hello: None if
     missing in a damaged file.

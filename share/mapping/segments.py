@@ -30,7 +30,7 @@ class Segment:
     """A segment of one agent's odometry.
 
     nodes: node ids, ascending. name: `agent/n`, the n-th of this agent. rank: the segment of the least rank,
-    among equals the oldest, is the reference of a map. total_count: keyframes it ever had.
+    among equals the oldest, is the reference of a map; even for headsets. total_count: keyframes it ever had.
     """
 
     agent: str
@@ -38,6 +38,11 @@ class Segment:
     rank: int = 0
     nodes: list[int] = field(default_factory=list)
     total_count: int = 0
+
+    @property
+    def is_worn(self) -> bool:
+        """Whether its agent is a headset, or served as one."""
+        return self.rank % 2 == 0
 
 
 class OdometrySegments:

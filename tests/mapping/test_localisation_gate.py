@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.atlas_sim import Walker, loop, settle
@@ -64,8 +66,17 @@ def test_the_wait_is_bounded_by_keyframes_with_loops(gate: LocalisationGate) -> 
 
 def test_the_gate_opens_wider_with_the_keyframes_that_did_not_help() -> None:
     gate = LocalisationGate(enter_m=0.05)
-    waits = [bool(gate.update(ANN, ALL, {BOB: known(9.9, answers=keyframe)})) for keyframe in range(8)]
-    assert waits == [True] * 7 + [False]
+    waits = [bool(gate.update(ANN, ALL, {BOB: known(9.9, answers=keyframe)})) for keyframe in range(16)]
+    assert waits == [True] * 15 + [False]
+
+
+def test_a_robot_waits_until_it_is_surer_unless_it_comes_with_a_wearer(gate: LocalisationGate) -> None:
+    robot = dataclasses.replace(known(2.1), is_worn=False)
+    gate.update(ROBOT, ALL, {ROBOT: known(0.0)})
+    assert gate.update(ANN, ALL, {ROBOT: robot}).keys() == {ROBOT}
+    assert not gate.update(ANN, ALL, {ROBOT: dataclasses.replace(robot, sigma_m=0.019)})
+    gate.update(BOB, ALL, {BOB: known(0.0), EVE: dataclasses.replace(robot, sigma_m=0.0)})
+    assert not gate.update(ANN, ALL, {BOB: known(3.0), EVE: robot})
 
 
 def test_a_rotation_counts_by_what_is_three_metres_ahead() -> None:
