@@ -41,6 +41,29 @@ def new_file(out: Path) -> Iterator[IO[bytes]]:
         yield file
 
 
+def write_private(path: Path, data: bytes | str, replaces: bool = False) -> None:
+    """Write a file that no other user can read at any moment, synced to disk.
+
+    replaces: put it in the place of an old one, in one step; else the name must be new. Raises ShareError.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    with write_errors(path):
+        new = path.with_name(f".{path.name}.new") if replaces else path
+        if replaces:
+            new.unlink(missing_ok=True)
+        handle = os.open(new, _NEW_FILE_FLAGS, 0o600)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            if replaces:
+                new.replace(path)
+        except OSError:
+            new.unlink(missing_ok=True)
+            raise
+
+
 @contextlib.contextmanager
 def _replacing(path: Path) -> Iterator[IO[bytes]]:
     """Yield a temporary file beside `path` that replaces it at the end of the block, synced to disk."""

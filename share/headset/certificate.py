@@ -18,7 +18,7 @@ from pathlib import Path
 from share.errors import UsageError, install_hint
 from share.files.locks import folder_locked
 from share.files.reading import MB, open_regular, read_bytes
-from share.files.writing import write_errors, xdg_folder
+from share.files.writing import write_private, xdg_folder
 
 _CERTIFICATE, _KEY, _SECRET = "headset.crt", "headset.key", "headset.secret"
 _VALID_DAYS = 730
@@ -92,7 +92,7 @@ def session_key(folder: Path) -> bytes:
     _make_folder(folder)
     with folder_locked(folder):
         if not path.exists():
-            _write_private(path, secrets.token_bytes(_SECRET_BYTES))
+            write_private(path, secrets.token_bytes(_SECRET_BYTES), replaces=True)
         _check_secret(path)
         data = _read(path, str(path))
     if len(data) != _SECRET_BYTES:
@@ -157,8 +157,8 @@ def _make(certificate: Path, key: Path, host: str, now: datetime) -> None:
     pem = private.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    _write_private(key, pem)
-    _write_private(certificate, made.public_bytes(serialization.Encoding.PEM))
+    write_private(key, pem, replaces=True)
+    write_private(certificate, made.public_bytes(serialization.Encoding.PEM), replaces=True)
 
 
 def _read(path: Path, where: str) -> bytes:
@@ -183,16 +183,3 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
-
-
-def _write_private(path: Path, data: bytes) -> None:
-    """Write a file that no other user can read at any moment, in the place of an old one. Raises
-    ShareError."""
-    with write_errors(path):
-        new = path.with_name(f".{path.name}.new")
-        new.unlink(missing_ok=True)
-        with os.fdopen(os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)

@@ -21,8 +21,9 @@ from http import HTTPStatus
 from pathlib import Path
 from urllib.parse import parse_qsl, urlencode
 
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.files.reading import open_regular
+from share.files.writing import write_private
 from share.net.transport import Address, bind_error, parse_address
 
 _LEAST_TOKEN, _MOST_TOKEN, _MAX_FILE_BYTES = 16, 256, 4096
@@ -175,12 +176,13 @@ def read_token(path: Path) -> str:
     try:
         if not os.path.lexists(path):
             token = secrets.token_urlsafe(24)
-            with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
-                file.write(f"{token}\n")
+            write_private(path, f"{token}\n")
             return token
         with open_regular(path, _MAX_FILE_BYTES) as stored:
             is_secret = not os.fstat(stored.fileno()).st_mode & 0o077
             token = stored.read().decode("ascii", "replace").strip()
+    except ShareError as error:
+        raise UsageError(f"--http-token {error}") from None
     except OSError as error:
         raise UsageError(f"--http-token {path}: {error.strerror or error}") from None
     if not is_secret:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 from share.errors import UsageError
 from share.files.locks import folder_locked
 from share.files.reading import MAX_KEYS_BYTES, read_text
-from share.files.writing import atomic_write, write_errors, xdg_folder
+from share.files.writing import atomic_write, write_private, xdg_folder
 from share.wire.room_messages import Permission
 
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
@@ -167,7 +167,7 @@ def generate_pair(folder: Path, name: str | None = None) -> KeyPair:
         while not public[:1].isalnum():  # a command line could take the key for an option otherwise
             public, secret = zmq.curve_keypair()
         pair = KeyPair(name, public.decode(), secret.decode())
-        _write_secret(folder / f"{name}.secret", f"share-secret-key {name} {pair.secret}\n")
+        write_private(folder / f"{name}.secret", f"share-secret-key {name} {pair.secret}\n")
         atomic_write(folder / f"{name}.public", _format_line(name, pair.public))
     return pair
 
@@ -387,17 +387,3 @@ def _check_not_world_writable(path: Path, status: os.stat_result) -> None:
     """Raises UsageError if any user could authorize keys."""
     if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
         raise UsageError(f"{path}: all users can write to it; `chmod o-w {path}`")
-
-
-def _write_secret(path: Path, text: str) -> None:
-    """Write a new file that no other user can read at any moment. Raises ShareError, also if it exists."""
-    with write_errors(path):
-        handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
-        try:
-            with os.fdopen(handle, "w") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError:
-            path.unlink()
-            raise
