@@ -31,7 +31,7 @@ from share.headset.pairing import PairingError
 from share.headset.shared_room import SharedRoom
 from share.headset.wearers import EdgeAccess, PageSeat, Wearer, WearerRegistry
 from share.net.bounded_websocket import (
-    HANDSHAKE_S,
+    BoundedListener,
     ModestSelector,
     PeerConnections,
     PeerLimits,
@@ -73,12 +73,13 @@ class HeadsetServer:
     """Serves until the pipe ends. Raises ShareError, OSError."""
 
     def __init__(self, pipe: Connection, listener: socket.socket, settings: HeadsetSettings) -> None:
-        self._pipe, self._listener, self._settings = pipe, listener, settings
+        self._pipe, self._settings = pipe, settings
         certificate = settings.certificate
         self._tls = None if certificate is None else certificate.context()
         names = own_names(settings.host, () if certificate is None else certificate.names)
         self._guard = PageGuard("http" if certificate is None else "https", names, read_page(settings.folder))
         self._connections = PeerConnections(_LIMITS)
+        self._listener = BoundedListener(listener, self._connections)
         self._room, self._wearers = SharedRoom(), WearerRegistry(settings.access, settings.session_key)
         self._table = MeasureTable(settings.table)
         self._path_due_s, self._code_shown = 0.0, ""
@@ -93,10 +94,8 @@ class HeadsetServer:
         loop = asyncio.get_running_loop()
         server = await serve_bounded(
             self._serve_page,
-            self._connections,
-            sock=self._listener,
-            ssl=self._tls,
-            **({} if self._tls is None else {"ssl_handshake_timeout": HANDSHAKE_S}),
+            self._listener,
+            self._tls,
             max_size=page.MAX_PAGE_BYTES,
             write_limit=_UNSENT_BYTES,
             close_timeout=_CLOSE_S,
