@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import gc
 import pickle
 import socket
 import threading
@@ -86,6 +87,7 @@ class HeadsetServer:
         self._ended = asyncio.Event()
 
     def run(self) -> None:
+        gc.freeze()  # what stays is not looked at again and again
         loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
         loop.set_exception_handler(lambda _loop, _context: None)  # anybody can cause failed handshakes
         loop.run_until_complete(self._serve())

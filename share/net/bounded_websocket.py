@@ -1,14 +1,15 @@
 """WebSocket connections that cannot cost their server much, for `websockets.asyncio.server.serve`.
 
 A connection counts from its `accept()` on, before TLS, not from its first message. What waits too long, or
-sends more than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets that of one
-that has long had it: who reads for ever cannot be told apart from who only holds a place. Some places may
-be kept for programs of the server's own machine.
+sends more than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets
+that of one that has long had it: who reads for ever cannot be told apart from who only holds a place. Some
+places may be kept for programs of the server's own machine.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import selectors
 import socket
@@ -27,6 +28,7 @@ from share.timing import TokenBucket
 BACKLOG = 16  # that many are accepted at once
 HANDSHAKE_S = 5.0  # from the connection, or the end of TLS's handshake, to the request's end
 TLS_S = 2.0  # for TLS's handshake, and for its end
+_COLLECTED = 64  # connections: asyncio leaves the 256 kB of each unfinished TLS to the garbage collector
 SURE_S = 60.0  # that a place is its holder's, except that an address with more gives it to one with fewer
 PING_S = 10.0  # between PINGs, and until their answer: who gives none is disconnected
 _MAX_SLEEP_S = 0.1
@@ -35,8 +37,9 @@ _MAX_SLEEP_S = 0.1
 @dataclass(frozen=True)
 class PeerLimits:
     """max_open: connections served at once (`place_to_free`). max_waiting: before they are let in, or on
-    their way out; one more closes the oldest of the address with the most. A peer may send `burst` frames and `burst_bytes` at once, and
-    more by and by (per s). kept_open: of max_open, for peers of the server's own machine."""
+    their way out; one more closes the oldest of the address with the most. A peer may send `burst` frames and
+    `burst_bytes` at once, and more by and by (per s). kept_open: of max_open, for peers of the server's own
+    machine."""
 
     max_open: int
     max_waiting: int
@@ -169,13 +172,16 @@ class BoundedListener(socket.socket):
     accepted."""
 
     def __init__(self, listener: socket.socket, connections: PeerConnections) -> None:
-        self.connections = connections
+        self.connections, self.is_collected, self._count = connections, False, 0
         super().__init__(listener.family, listener.type, listener.proto, fileno=listener.detach())
 
     def accept(self) -> tuple[socket.socket, Any]:
         plain, address = super().accept()
         accepted = AcceptedSocket(plain, self.connections)
         self.connections.arrive(accepted)
+        self._count += 1
+        if self.is_collected and self._count % _COLLECTED == 0:
+            gc.collect()
         return accepted, address
 
 
@@ -256,6 +262,7 @@ def serve_bounded(handler: Any, listener: BoundedListener, ssl: Any = None, **op
 
     ssl: a TLS context, or None. options: the others of `websockets.asyncio.server.serve`.
     """
+    listener.is_collected = ssl is not None
     tls_times = {} if ssl is None else {"ssl_handshake_timeout": TLS_S, "ssl_shutdown_timeout": TLS_S}
     logger = logging.Logger("share.websocket")
     logger.addHandler(logging.NullHandler())  # anybody can cause failed handshakes

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import asyncio.sslproto
 import contextlib
 import socket
 import ssl
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,10 +25,22 @@ LIMITS = (4, 10, 200, 100.0, 2**18, 2**17)
     subprocess.run([sys.executable, "-c", "import cryptography"], capture_output=True).returncode != 0,
     reason="cryptography is not installed",
 )
-def test_an_unfinished_tls_hello_has_a_place_of_few_and_two_seconds(tmp_path: Path) -> None:
+def test_an_unfinished_tls_hello_has_a_place_of_few_and_two_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from websockets.asyncio.client import connect
 
     from share.headset.certificate import own_certificate
+
+    ended = []
+
+    class Protocol(asyncio.sslproto.SSLProtocol):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            ended.append(weakref.ref(self))
+
+    monkeypatch.setattr(asyncio.sslproto, "SSLProtocol", Protocol)
+    monkeypatch.setattr(bounded, "_COLLECTED", 16)
 
     async def count(handler_calls: list[int]) -> None:
         connections = bounded.PeerConnections(bounded.PeerLimits(*LIMITS))
@@ -58,6 +73,7 @@ def test_an_unfinished_tls_hello_has_a_place_of_few_and_two_seconds(tmp_path: Pa
             while connections._waiting:
                 await asyncio.sleep(0.05)
                 assert time.monotonic() - began < bounded.TLS_S + 10
+            assert sum(one() is not None for one in ended) <= 30, "their memory is freed by and by"
             assert not any(is_open(one) for one in silent)
 
     handler_calls: list[int] = []
