@@ -25,6 +25,7 @@ from share.headset.certificate import (
 from share.headset.measures import HEADSET_TABLE, ServerReport, begin_table
 from share.headset.mounts import read_mounts
 from share.headset.page_requests import FOLDER
+from share.headset.session_ledger import SessionLedger
 from share.headset.wearers import EdgeAccess
 from share.net.http_guard import listen, served_address
 from share.net.transport import Address, parse_address
@@ -94,6 +95,7 @@ class HeadsetPage(ServedPage):
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
         table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
+        SessionLedger(default_folder())  # a damaged one is said before the page is served
         listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
@@ -107,6 +109,7 @@ class HeadsetPage(ServedPage):
             where.host,
             self.certificate,
             session_key(default_folder()),
+            default_folder(),
             time.monotonic(),
             known_mounts,
             table,

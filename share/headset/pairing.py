@@ -32,6 +32,10 @@ class PairingError(Exception):
     """A wearer is not let in; the text is for it."""
 
 
+class SessionOverError(PairingError):
+    """A session is good no more; its page forgets it."""
+
+
 class WearerSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Whose a session is. agent: whose device sits on the headset; None: none's. end_s: wall clock. nonce:
     tells it from other sessions of this wearer."""
@@ -52,8 +56,8 @@ def seal(key: bytes, session: WearerSession) -> str:
 
 
 def unseal(key: bytes, secret: str, now_s: float) -> WearerSession:
-    """Return the session of a secret. now_s: wall clock. Raises PairingError."""
-    unknown = PairingError("this session is not known here; pair again with the code of the edge")
+    """Return the session of a secret. now_s: wall clock. Raises SessionOverError."""
+    unknown = SessionOverError("this session is not known here; pair again with the code of the edge")
     if len(secret) > _MAX_SESSION_LENGTH:
         raise unknown
     try:
@@ -63,9 +67,12 @@ def unseal(key: bytes, secret: str, now_s: float) -> WearerSession:
     signature, payload = data[:_SIGNATURE_BYTES], data[_SIGNATURE_BYTES:]
     if not hmac.compare_digest(signature, _signature(key, payload)):
         raise unknown
-    session = _decoder.decode(payload)
+    try:
+        session = _decoder.decode(payload)
+    except msgspec.DecodeError:  # of another release
+        raise unknown from None
     if not now_s < session.end_s <= now_s + 2 * SESSION_S:
-        raise PairingError("this session is over; pair again with the code of the edge")
+        raise SessionOverError("this session is over; pair again with the code of the edge")
     return session
 
 

@@ -28,7 +28,8 @@ from share.headset.certificate import PageCertificate
 from share.headset.measures import MeasureTable, ServerReport, encode_report, measured_fields
 from share.headset.mounts import ViewerMount
 from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
-from share.headset.pairing import PairingError
+from share.headset.pairing import PairingError, SessionOverError
+from share.headset.session_ledger import SessionLedger
 from share.headset.shared_room import SharedRoom
 from share.headset.wearers import EdgeAccess, PageSeat, Wearer, WearerRegistry
 from share.net.bounded_websocket import (
@@ -57,13 +58,15 @@ _MAX_MOVES = 32  # of maps, that a page was told
 @dataclass(frozen=True)
 class HeadsetSettings:
     """What the server is started with. certificate: None: plain HTTP, of this machine alone. host: that it
-    listens on. session_key: that signs sessions. began_s: when the page began, monotonic. table: where what
+    listens on. session_key: that signs sessions. sessions: the folder that says which ones
+    are the newest. began_s: when the page began, monotonic. table: where what
     pages measure is written. folder: with the page's files."""
 
     access: EdgeAccess
     host: str
     certificate: PageCertificate | None
     session_key: bytes = field(repr=False)
+    sessions: Path
     began_s: float
     mounts: dict[str, ViewerMount] = field(default_factory=dict)
     table: Path | None = None
@@ -81,7 +84,10 @@ class HeadsetServer:
         self._guard = PageGuard("http" if certificate is None else "https", names, read_page(settings.folder))
         self._connections = PeerConnections(_LIMITS)
         self._listener = BoundedListener(listener, self._connections)
-        self._room, self._wearers = SharedRoom(), WearerRegistry(settings.access, settings.session_key)
+        self._room = SharedRoom()
+        self._wearers = WearerRegistry(
+            settings.access, settings.session_key, SessionLedger(settings.sessions), self._notify
+        )
         self._table = MeasureTable(settings.table)
         self._path_due_s, self._code_shown = 0.0, ""
         self._ended = asyncio.Event()
@@ -179,6 +185,9 @@ class HeadsetServer:
             self._code_shown = desk.code
             self._tell(ServerReport(f"headset page: the code for the next wearer is {desk.code}"))
 
+    def _notify(self, line: str) -> None:
+        self._tell(ServerReport(line))
+
     # ------------------------------------------------------------------ requests
 
     def _answer(self, connection: Any, request: Any) -> Response | None:
@@ -207,7 +216,7 @@ class HeadsetServer:
             connection.transport.abort()
             return
         except (PairingError, page.MessageError) as error:
-            await _refuse(connection, str(error))
+            await _refuse(connection, str(error), isinstance(error, SessionOverError))
             return
         self._connections.leave(connection)  # its place is its own from now on
         seat, taken_over = PageSeat(connection), wearer.seat
@@ -217,7 +226,7 @@ class HeadsetServer:
         sender = asyncio.create_task(_send(seat))
         try:
             if taken_over is not None:
-                await _refuse(taken_over.connection, f"another page goes on as '{wearer.name}'")
+                await _refuse(taken_over.connection, f"another page goes on as '{wearer.name}'", True)
             await self._read(wearer, seat)
         except page.MessageError as error:
             sender.cancel()
@@ -326,9 +335,10 @@ async def _send(seat: PageSeat) -> None:
     seat.connection.transport.abort()
 
 
-async def _refuse(connection: Any, reason: str) -> None:
+async def _refuse(connection: Any, reason: str, is_over: bool = False) -> None:
+    """Say why a page is not served, and close. is_over: it shall forget its session."""
     with contextlib.suppress(TimeoutError, ConnectionClosed):
         async with asyncio.timeout(_CLOSE_S):
-            await connection.send(page.encode_page({"type": "refused", "reason": reason}))
+            await connection.send(page.encode_page({"type": "refused", "reason": reason, "is_over": is_over}))
             await connection.close(1008)
     connection.transport.abort()

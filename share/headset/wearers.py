@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from share.agent_names import checked_name
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.headset.outbox import Outbox
 from share.headset.page_messages import (
     PageCancel,
@@ -21,7 +21,8 @@ from share.headset.page_messages import (
     PageMeasured,
     PageRequest,
 )
-from share.headset.pairing import SESSION_S, PairingDesk, PairingError, WearerSession, seal, unseal
+from share.headset.pairing import PairingDesk, PairingError, SessionOverError, WearerSession, seal, unseal
+from share.headset.session_ledger import SessionLedger
 from share.headset.wearer_link import Tell, WearerLink, refusal_of
 from share.net.keys import AgentKeys, allow_list
 from share.net.lent_keys import LentKeys
@@ -30,7 +31,6 @@ from share.wire.room_messages import Permission
 
 MAX_WEARERS = 8
 ABSENT_S = 6.0  # a page that is away for longer commands no robot: what it sent stops
-_MAX_KNOWN = 256  # names whose newest session is remembered
 _POINTS_LIMIT = (2.0, 0.5)  # times that a page is sent the points of a map, at once and a second
 _COMMAND_LIMIT = (5.0, 2.0)  # goals of a page, and as many stops, at once and a second
 _MAX_COMMANDS = 16  # of a wearer, whose state is told again to a page that comes back
@@ -197,13 +197,16 @@ def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *argum
 
 
 class WearerRegistry:
-    """Lets wearers in. key: that sessions are signed with."""
+    """Lets wearers in. key: that sessions are signed with. ledger: of the newest ones. notify: is called with
+    a line for the operator."""
 
-    def __init__(self, access: EdgeAccess, key: bytes) -> None:
+    def __init__(
+        self, access: EdgeAccess, key: bytes, ledger: SessionLedger, notify: Callable[[str], None]
+    ) -> None:
         self.desk = PairingDesk(secrets.randbelow)
         self._access, self._key = access, key
         self._wearers: dict[str, Wearer] = {}
-        self._nonces: dict[str, str] = {}  # of the newest session of each name
+        self._ledger, self._notify = ledger, notify
 
     def __iter__(self) -> Any:
         return iter(list(self._wearers.values()))
@@ -212,8 +215,8 @@ class WearerRegistry:
         """Return the wearer of a hello, its session's secret and its rights. Raises PairingError."""
         if hello.session is not None:
             session = unseal(self._key, hello.session, time.time())
-            if self._nonces.get(session.name, session.nonce) != session.nonce:
-                raise PairingError(f"another headset has paired as '{session.name}' since; pair again")
+            if not self._ledger.is_newest(session):
+                raise SessionOverError(f"another headset has paired as '{session.name}' since; pair again")
             rights = self._access.rights_of(session.name)
         else:
             session, rights = self._pair(hello, address)
@@ -240,15 +243,18 @@ class WearerRegistry:
         if wearer is None and len(self._wearers) >= MAX_WEARERS:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
         self.desk.renew()
-        return WearerSession(name, agent, time.time() + SESSION_S, secrets.token_urlsafe(12)), rights
+        end_s = self._ledger.end_of_new(name, time.time())
+        return WearerSession(name, agent, end_s, secrets.token_urlsafe(12)), rights
 
     def _add(self, session: WearerSession) -> Wearer:
         if len(self._wearers) >= MAX_WEARERS:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
-        self._nonces.pop(session.name, None)
-        self._nonces[session.name] = session.nonce
-        while len(self._nonces) > _MAX_KNOWN:
-            del self._nonces[next(iter(self._nonces))]
+        try:
+            self._ledger.note(session, time.time())
+        except (ShareError, OSError) as error:
+            self._notify(
+                f"headset page: {error}: after a start of the edge, sessions that are over may be good again"
+            )
         name, access = session.name, self._access
         wearer = Wearer(session, lambda tell: WearerLink(access.address, name, access.keys_of(name), tell))
         self._wearers[name] = wearer

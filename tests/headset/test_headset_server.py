@@ -122,14 +122,19 @@ def test_nothing_is_said_before_a_code(fresh: HeadsetPage) -> None:
         with pytest.raises(TimeoutError):
             stranger.hear(0.5)
         stranger.send(type="ping", n=1, sent_ms=0)
-        assert stranger.hear() == {"type": "refused", "reason": "a page begins with hello"}
+        assert stranger.hear() == {
+            "type": "refused",
+            "reason": "a page begins with hello",
+            "is_over": False,
+        }
         assert stranger.is_closed()
     used = code(fresh)
     paired(fresh, "ann").close()
     for wrong in ({"code": used, "name": "bob"}, {"session": "A" * 64}):  # replayed; forged
         with PageClient(fresh.endpoint) as stranger:
             answer = stranger.hello(**wrong)
-            assert answer["type"] == "refused" and list(answer) == ["type", "reason"]
+            assert answer["type"] == "refused" and list(answer) == ["type", "reason", "is_over"]
+            assert answer["is_over"] == ("session" in wrong)
             assert stranger.is_closed() and len(stranger.seen) == 1
     assert code(fresh) != used
 
@@ -403,6 +408,22 @@ def test_a_server_that_is_killed_comes_back_and_knows_its_wearers(
             assert soon(lambda: len(table.read_text().splitlines()) == 3)  # nothing of before is lost
     assert told[0].startswith("headset page: the code for the next wearer is ")
     assert "headset page: 'ann' has paired, with the device of 'ann'" in told
+
+
+def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomServer) -> None:
+    with closing(serve(site, edge.address)) as page:
+        with paired(page, "ann") as first:
+            old = first.seen[0]["session"]
+        assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": False})["is_connected"])
+        with paired(page, "ann") as second:
+            new = second.seen[0]["session"]
+    with closing(serve(site, edge.address)) as page:
+        code(page)
+        for session, answer in ((old, "refused"), (new, "welcome"), (old, "refused")):
+            with PageClient(page.endpoint) as one:
+                said = one.hello(session=session)
+                assert said["type"] == answer
+                assert answer == "welcome" or (said["is_over"] and "another headset" in said["reason"])
 
 
 def test_an_edge_that_goes_and_comes_is_told_and_all_heals(site: Path) -> None:

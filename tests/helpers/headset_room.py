@@ -119,7 +119,7 @@ class HeadsetRoom:
                 if "code" in hello
                 else "this session has ended: pair again"
             )
-            connection.send(json.dumps({"type": "refused", "reason": reason}))
+            connection.send(json.dumps({"type": "refused", "reason": reason, "is_over": True}))
             return
         name, agent = self._names[session]
         mount = None if self.mount is None else self.mount.ravel().tolist()
