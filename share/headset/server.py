@@ -31,7 +31,7 @@ from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names
 from share.headset.pairing import PairingError, SessionOverError
 from share.headset.session_ledger import SessionLedger
 from share.headset.shared_room import SharedRoom
-from share.headset.wearers import EdgeAccess, PageSeat, Wearer, WearerRegistry
+from share.headset.wearers import EdgeAccess, ListDamagedError, PageSeat, Wearer, WearerRegistry
 from share.net.bounded_websocket import (
     BoundedListener,
     ModestSelector,
@@ -90,7 +90,7 @@ class HeadsetServer:
         )
         self._table = MeasureTable(settings.table)
         self._path_due_s, self._code_shown = 0.0, ""
-        self._ended = asyncio.Event()
+        self._ended, self._tasks = asyncio.Event(), set[asyncio.Task[None]]()
 
     def run(self) -> None:
         gc.freeze()  # what stays is not looked at again and again
@@ -114,11 +114,39 @@ class HeadsetServer:
         while not self._ended.is_set():
             self._report()
             self._wearers.remove_absent(time.monotonic())
+            self._remove_unwanted()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_REPORT_S):
                     await self._ended.wait()
         self._wearers.close()
         server.close()
+
+    def _remove_unwanted(self) -> None:
+        """End pages whose session is over, or whose wearer has gone from the list of keys; one whose rights
+        have changed comes back and is told so."""
+        for wearer in self._wearers:
+            if (seat := wearer.seat) is None:
+                continue
+            try:
+                if self._wearers.rights_now(wearer) != seat.rights:
+                    seat.connection.transport.abort()
+            except ListDamagedError:
+                continue  # the edge says so itself
+            except PairingError as error:
+                self._dismiss(wearer, seat, error)
+
+    def _dismiss(self, wearer: Wearer, seat: PageSeat, error: PairingError) -> None:
+        """End a page, and what its wearer's robots do."""
+        self._tell(ServerReport(f"headset page: '{wearer.name}' has to go: {error}"))
+        wearer.stop_robots()
+        wearer.leave(seat)
+        self._end_page(seat, str(error), isinstance(error, SessionOverError))
+
+    def _end_page(self, seat: PageSeat, reason: str, is_over: bool) -> None:
+        """Refuse a page by and by: one that is dead does not hold up another."""
+        task = asyncio.create_task(_end(seat, reason, is_over))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     # ------------------------------------------------------------------ the edge
 
@@ -219,20 +247,22 @@ class HeadsetServer:
             await _refuse(connection, str(error), isinstance(error, SessionOverError))
             return
         self._connections.leave(connection)  # its place is its own from now on
-        seat, taken_over = PageSeat(connection), wearer.seat
+        seat, taken_over = PageSeat(connection, rights), wearer.seat
         seat.reply(self._welcome(wearer, secret, rights))
         wearer.sit(seat)
         seat.outbox.put_poses(self._room.poses())
         sender = asyncio.create_task(_send(seat))
         try:
             if taken_over is not None:
-                await _refuse(taken_over.connection, f"another page goes on as '{wearer.name}'", True)
+                self._end_page(taken_over, f"another page goes on as '{wearer.name}'", True)
             await self._read(wearer, seat)
         except page.MessageError as error:
             sender.cancel()
             await _refuse(connection, str(error))
-        except (TimeoutError, ConnectionClosed):
+        except (TimeoutError, ConnectionClosed) as error:
             connection.transport.abort()
+            if wearer.seat is seat and (isinstance(error, TimeoutError) or _has_left(error)):
+                wearer.stop_robots()
         finally:
             sender.cancel()
             wearer.leave(seat)
@@ -283,7 +313,21 @@ class HeadsetServer:
                 case page.PageHello():
                     raise page.MessageError("a page says hello once")
                 case wish:
-                    wearer.ask(wish)
+                    self._ask(wearer, seat, wish)
+
+    def _ask(self, wearer: Wearer, seat: PageSeat, wish: page.PageRequest | page.PageCommand) -> None:
+        """Do what a page wants, if its wearer may still be here."""
+        if wearer.seat is not seat:
+            return  # another page has taken over, or its wearer had to go
+        try:
+            self._wearers.rights_now(wearer)
+        except ListDamagedError:
+            pass  # the edge answers
+        except PairingError as error:
+            wearer.refuse(wish, str(error))
+            self._dismiss(wearer, seat, error)
+            return
+        wearer.ask(wish)
 
     def _send_points(self, seat: PageSeat, map_id: str) -> None:
         points = self._room.points(map_id)
@@ -333,6 +377,21 @@ async def _send(seat: PageSeat) -> None:
     except TimeoutError:
         pass
     seat.connection.transport.abort()
+
+
+def _has_left(error: ConnectionClosed) -> bool:
+    """Return whether a page was closed, or another loaded in its place. A page that reconnects gives no
+    code."""
+    return error.rcvd is not None and error.rcvd.code in (1000, 1001)
+
+
+async def _end(seat: PageSeat, reason: str, is_over: bool) -> None:
+    """Send a page the answers that wait, and end it."""
+    for message in seat.outbox.take_replies():
+        with contextlib.suppress(TimeoutError, ConnectionClosed):
+            async with asyncio.timeout(_CLOSE_S):
+                await seat.connection.send(page.encode_page(message))
+    await _refuse(seat.connection, reason, is_over)
 
 
 async def _refuse(connection: Any, reason: str, is_over: bool = False) -> None:

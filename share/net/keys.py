@@ -43,10 +43,12 @@ class KeyPair:
 
 @dataclass(frozen=True)
 class AgentKeys:
-    """Keys of an agent: its own pair and the public key of its edge."""
+    """Keys of an agent: its own pair and the public key of its edge. is_lent: the edge made the pair, for a
+    name of its list."""
 
     own: KeyPair
     edge: str
+    is_lent: bool = False
 
 
 @dataclass(frozen=True)
