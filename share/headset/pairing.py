@@ -1,4 +1,4 @@
-"""Who may use the headset page: a code of six digits lets one wearer in, a signed session lets it come back.
+"""Who may use the headset page: a code of eight digits lets one wearer in; by a signed session it comes back.
 
 The code is shown to the operator alone. It changes once it has been used, or after some wrong ones. A session
 says whose it is and when it ends, under a signature (HMAC, RFC 2104) that only this machine can make, so a
@@ -18,11 +18,11 @@ import msgspec
 
 from share.timing import TokenBucket, TokenBuckets
 
-CODE_DIGITS = 6
-MAX_WRONG = 10  # codes given, after which a new one is shown
+CODE_DIGITS = 8
+MAX_WRONG = 1000  # codes given, after which a new one is shown: fewer would let a stranger change it at will
 SESSION_S = 12 * 3600.0
 _ADDRESS_LIMIT = (3.0, 0.1)  # codes at once, and a second, of an address
-_LIMIT = (10.0, 0.2)  # of all together: a guess hits with 0.07 % in an hour
+_LIMIT = (20.0, 2.0)  # of all together, which twenty addresses use up: a guess hits with 0.007 % in an hour
 _MAX_ADDRESSES = 1024
 _SIGNATURE_BYTES = 16
 _MAX_SESSION_LENGTH = 1024  # characters

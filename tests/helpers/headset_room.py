@@ -23,7 +23,7 @@ from share.geometry import se3
 from share.types import F64
 
 PAGE = Path(__file__).resolve().parents[2] / "share" / "headset" / "page"
-CODE = "483921"
+CODE = "48392175"
 MAP = "ann-1/0"
 _OWN = "script-src 'self'; style-src 'self'; connect-src 'self'"
 _POLICY = f"default-src 'none'; {_OWN}; base-uri 'none'; form-action 'none'"
