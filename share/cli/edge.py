@@ -214,7 +214,7 @@ class _EdgePages:
 
         self.run: EdgeRun | None = None
         self.observers: list[EdgeObserver] = []
-        self._stderr, self._addresses = stderr, list[str]()
+        self._stderr, self._addresses, self._is_guarded = stderr, list[str](), token is not None
         self._stack = stack
         self._room: LiveRoom | None = None
         self._headset: HeadsetPage | None = None
@@ -254,7 +254,7 @@ class _EdgePages:
         if self._room is not None and self._room.is_alive:
             report = report | {"live_room": self._room.endpoint}
         if self._headset is not None and self._headset.is_alive:
-            report = report | {"headset": self._headset.report()}
+            report = report | {"headset": self._headset.shown_report(self._is_guarded)}
         return report
 
     def print_addresses(self, token_file: Path | None) -> None:

@@ -103,6 +103,7 @@ class HeadsetPage(ServedPage):
         self.url = f"{self.scheme}://{shown}/"
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
+        self._has_keys = access.keys_folder is not None
         feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
         settings = HeadsetSettings(
             access,
@@ -123,6 +124,12 @@ class HeadsetPage(ServedPage):
         any thread."""
         fingerprint = None if self.certificate is None else self.certificate.fingerprint
         return {"address": self.url, "fingerprint": fingerprint, **self._report}
+
+    def shown_report(self, is_guarded: bool) -> dict[str, Any]:
+        """Return the report for readers. is_guarded: they have given a token. A code opens what its wearer's
+        key does, so with keys nobody else gets it."""
+        report = self.report()
+        return report | {"code": ""} if self._has_keys and not is_guarded else report
 
     def _hear(self, data: bytes) -> None:
         """Take what the process says."""

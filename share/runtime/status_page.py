@@ -368,7 +368,7 @@ function showHeadset(headset) {
   at("headset").hidden = !headset;
   if (!headset) return;
   at("address").textContent = headset.address;
-  at("code").textContent = headset.code;
+  at("code").textContent = headset.code || "on the edge's terminal";
   at("fingerprint").textContent = headset.fingerprint;
   const mm = (x, unit) => Number.isFinite(x) ? `${fixed(x, 1)} ${unit}` : "–";
   table("wearers",

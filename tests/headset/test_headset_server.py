@@ -109,6 +109,10 @@ def test_two_wearers_see_one_object_and_its_owner(fresh: HeadsetPage, edge: Room
         assert {one["name"] for one in edge.edge.room.report()["clients"]} >= {"ann", "bob"}
 
 
+def test_without_keys_the_code_is_for_every_program_of_the_machine(served: HeadsetPage) -> None:
+    assert served.shown_report(is_guarded=False)["code"] == code(served) != ""
+
+
 def test_the_page_learns_the_servers_clock(fresh: HeadsetPage) -> None:
     with paired(fresh, "ann") as ann:
         before_ms = time.monotonic_ns() / 1e6
@@ -346,6 +350,8 @@ def test_who_is_taken_off_the_list_has_to_go_and_may_come_back(
     access = EdgeAccess(edge.address, ALL, folder, public[0], bytes(32))
     told: list[str] = []
     with closing(serve(site, edge.address, access=access, notify=told.append)) as page:
+        assert code(page) == page.shown_report(is_guarded=True)["code"]
+        assert code(page) not in str(page.shown_report(is_guarded=False))
         with PageClient(page.endpoint) as ann:
             welcome = ann.hello(code=code(page), name="ann")
             assert welcome["may"] == {"objects": True, "commands": False}
