@@ -37,6 +37,7 @@ class HeadsetRoom:
         self.agents, self.objects = agents, dict[int, dict[str, Any]]()
         self.received = list[dict[str, Any]]()  # of pages; with the moment, ns
         self.map_id, self.delay_s, self.refusal = MAP, 0.012, ""
+        self.hindrance = ""  # why nobody is let in for now
         self.mount: F64 | None = None
         self.may = {"objects": True, "commands": True}
         self.paths: dict[str, list[list[float]]] = {}
@@ -108,6 +109,10 @@ class HeadsetRoom:
 
     def _serve(self, connection: ServerConnection) -> None:
         hello = json.loads(connection.recv())
+        if self.hindrance:
+            refused = {"type": "refused", "reason": self.hindrance, "is_over": False}
+            connection.send(json.dumps(refused))
+            return
         if "session" in hello and hello["session"] in self._names:
             session = hello["session"]
         elif hello.get("code") == CODE:
