@@ -28,6 +28,7 @@ from share.headset.certificate import PageCertificate
 from share.headset.measures import MeasureTable, ServerReport, encode_report, measured_fields
 from share.headset.mounts import ViewerMount
 from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
+from share.headset.page_sending import CLOSE_S, end_page, has_left, refuse, send_all
 from share.headset.pairing import PairingError, SessionOverError
 from share.headset.session_ledger import SessionLedger
 from share.headset.shared_room import SharedRoom
@@ -47,7 +48,7 @@ MAX_PAIRING, MAX_CONNECTIONS = 16, 100  # WebSockets that have not paired; conne
 # Of a page: files are asked for one by one; then it drags at 30 Hz, pings and measures.
 _LIMITS = PeerLimits(MAX_PAIRING, MAX_CONNECTIONS, 200, 100.0, 2**18, 2**17)
 SILENT_S = 6.0  # a page pings more often; one that does not has gone
-_HELLO_S, _SEND_S, _CLOSE_S = 5.0, 5.0, 1.0
+_HELLO_S = 5.0
 _REPORT_S, _PATH_S = 0.5, 1.0
 _BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
 _UNSENT_BYTES = 2**16  # that wait in a page's connection before the newest is awaited
@@ -106,7 +107,7 @@ class HeadsetServer:
             self._tls,
             max_size=page.MAX_PAGE_BYTES,
             write_limit=_UNSENT_BYTES,
-            close_timeout=_CLOSE_S,
+            close_timeout=CLOSE_S,
             process_request=self._answer,
         )
         self._listener.listen(_BACKLOG)
@@ -144,7 +145,7 @@ class HeadsetServer:
 
     def _end_page(self, seat: PageSeat, reason: str, is_over: bool) -> None:
         """Refuse a page by and by: one that is dead does not hold up another."""
-        task = asyncio.create_task(_end(seat, reason, is_over))
+        task = asyncio.create_task(end_page(seat, reason, is_over))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -244,24 +245,24 @@ class HeadsetServer:
             connection.transport.abort()
             return
         except (PairingError, page.MessageError) as error:
-            await _refuse(connection, str(error), isinstance(error, SessionOverError))
+            await refuse(connection, str(error), isinstance(error, SessionOverError))
             return
         self._connections.leave(connection)  # its place is its own from now on
         seat, taken_over = PageSeat(connection, rights), wearer.seat
         seat.reply(self._welcome(wearer, secret, rights))
         wearer.sit(seat)
         seat.outbox.put_poses(self._room.poses())
-        sender = asyncio.create_task(_send(seat))
+        sender = asyncio.create_task(send_all(seat))
         try:
             if taken_over is not None:
                 self._end_page(taken_over, f"another page goes on as '{wearer.name}'", True)
             await self._read(wearer, seat)
         except page.MessageError as error:
             sender.cancel()
-            await _refuse(connection, str(error))
+            await refuse(connection, str(error))
         except (TimeoutError, ConnectionClosed) as error:
             connection.transport.abort()
-            if wearer.seat is seat and (isinstance(error, TimeoutError) or _has_left(error)):
+            if wearer.seat is seat and (isinstance(error, TimeoutError) or has_left(error)):
                 wearer.stop_robots()
         finally:
             sender.cancel()
@@ -359,45 +360,3 @@ def _tell_move(wearer: Wearer, seat: PageSeat, move: Any) -> None:
         return
     T = move.T_new_old.ravel().tolist()
     seat.reply({"type": "map_changed", "old": move.old, "new": move.new, "T_new_old": T})
-
-
-async def _send(seat: PageSeat) -> None:
-    """Send what there is as it comes; a page that does not read is disconnected."""
-    try:
-        while not seat.outbox.is_overfull:
-            for message in seat.outbox.take(time.monotonic()):
-                async with asyncio.timeout(_SEND_S):
-                    await seat.connection.send(page.encode_page(message))
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(seat.outbox.wait_s(time.monotonic())):
-                    await seat.wake.wait()
-            seat.wake.clear()
-    except ConnectionClosed:
-        return
-    except TimeoutError:
-        pass
-    seat.connection.transport.abort()
-
-
-def _has_left(error: ConnectionClosed) -> bool:
-    """Return whether a page was closed, or another loaded in its place. A page that reconnects gives no
-    code."""
-    return error.rcvd is not None and error.rcvd.code in (1000, 1001)
-
-
-async def _end(seat: PageSeat, reason: str, is_over: bool) -> None:
-    """Send a page the answers that wait, and end it."""
-    for message in seat.outbox.take_replies():
-        with contextlib.suppress(TimeoutError, ConnectionClosed):
-            async with asyncio.timeout(_CLOSE_S):
-                await seat.connection.send(page.encode_page(message))
-    await _refuse(seat.connection, reason, is_over)
-
-
-async def _refuse(connection: Any, reason: str, is_over: bool = False) -> None:
-    """Say why a page is not served, and close. is_over: it shall forget its session."""
-    with contextlib.suppress(TimeoutError, ConnectionClosed):
-        async with asyncio.timeout(_CLOSE_S):
-            await connection.send(page.encode_page({"type": "refused", "reason": reason, "is_over": is_over}))
-            await connection.close(1008)
-    connection.transport.abort()
