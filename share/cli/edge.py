@@ -234,8 +234,8 @@ class _EdgePages:
 
         self.run: EdgeRun | None = None
         self.observers: list[EdgeObserver] = []
-        self._stderr, self._addresses = stderr, list[str]()
         self._stack, self._token_file, token = stack, served.token_file, served.token()
+        self._stderr, self._addresses, self._is_guarded = stderr, list[str](), token is not None
         self._room: LiveRoom | None = None
         self._headset: HeadsetPage | None = None
         if served.http is not None:
@@ -276,7 +276,7 @@ class _EdgePages:
         if self._room is not None and self._room.is_alive:
             report = report | {"live_room": self._room.endpoint}
         if self._headset is not None and self._headset.is_alive:
-            report = report | {"headset": self._headset.report()}
+            report = report | {"headset": self._headset.shown_report(self._is_guarded)}
         return report
 
     def print_addresses(self) -> None:

@@ -39,17 +39,31 @@ class PageCertificate:
 
     def context(self) -> ssl.SSLContext:
         """Return the settings of a TLS server with it. Raises UsageError."""
-        _read(self.key, f"--headset-key {self.key}")
+        text = _read(self.key, f"--headset-key {self.key}")
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         try:
             # an empty password: else OpenSSL asks the terminal for one
             context.load_cert_chain(self.certificate, self.key, password="")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-            is_other = "KEY_VALUES_MISMATCH" in str(error)
-            text = "is not the key of this certificate" if is_other else "is no key (PEM) without a password"
-            raise UsageError(f"--headset-key {self.key}: {text}") from None
+            raise UsageError(f"--headset-key {self.key}: {_key_fault(error, text)}") from None
         return context
+
+
+def _key_fault(error: Exception, text: bytes) -> str:
+    """Return why OpenSSL takes no key and its certificate. text: of the key's file."""
+    reason = getattr(error, "reason", None) or ""
+    if reason == "KEY_VALUES_MISMATCH":
+        return "is not the key of this certificate"
+    if reason in ("NO_CERTIFICATE_ASSIGNED", "KEY_TYPE_MISMATCH"):
+        return "is a key of another kind than the certificate's, so it is not the key of this certificate"
+    if reason == "EE_KEY_TOO_SMALL":
+        return "is too short to be safe; take ECDSA P-256, or RSA of 2048 bits or more"
+    if reason:
+        return f"OpenSSL does not take it with its certificate: {reason.lower().replace('_', ' ')}"
+    if b"ENCRYPTED" in text:
+        return "has a password, which nobody could give at the edge's start; give it without one"
+    return "is no key (PEM)"
 
 
 def default_folder() -> Path:
@@ -60,6 +74,7 @@ def default_folder() -> Path:
 def given_certificate(certificate: Path, key: Path, now: datetime | None = None) -> PageCertificate:
     """Return the certificate in two files. Raises UsageError."""
     found = _described(certificate, key, f"--headset-cert {certificate}")
+    _check_secret(key, f"--headset-key {key}")
     if found.end <= (now or datetime.now(UTC)):
         raise UsageError(
             f"--headset-cert {certificate}: it was valid until {found.end:%Y-%m-%d}; give a newer one"
@@ -76,10 +91,14 @@ def own_certificate(folder: Path, host: str, now: datetime | None = None) -> Pag
     _make_folder(folder)
     with folder_locked(folder):
         if certificate.exists() and key.exists():
-            _check_secret(key)
-            found = _described(certificate, key, str(certificate))
-            if found.end > now + timedelta(days=1):
+            _check_secret(key, str(key))
+            try:
+                found = _described(certificate, key, str(certificate))
                 found.context()
+            except UsageError as error:
+                text = str(error).removeprefix("--headset-key ")
+                raise UsageError(f"{text}; remove it, and one is made with its key") from None
+            if found.end > now + timedelta(days=1):
                 return found
         _make(certificate, key, host, now)
     return _described(certificate, key, str(certificate))
@@ -93,7 +112,7 @@ def session_key(folder: Path) -> bytes:
     with folder_locked(folder):
         if not path.exists():
             write_private(path, secrets.token_bytes(_SECRET_BYTES), replaces=True)
-        _check_secret(path)
+        _check_secret(path, str(path))
         data = _read(path, str(path))
     if len(data) != _SECRET_BYTES:
         raise UsageError(f"{path}: expected {_SECRET_BYTES} bytes; remove it, and one is made")
@@ -168,18 +187,23 @@ def _read(path: Path, where: str) -> bytes:
         raise UsageError(f"{where}: cannot be read: {error.strerror or error}") from None
 
 
-def _check_secret(path: Path) -> None:
+def _check_secret(path: Path, where: str) -> None:
+    """Raises UsageError if others than the owner can read or change a file."""
     try:
         with open_regular(path, _MAX_BYTES) as file:
             is_open = os.fstat(file.fileno()).st_mode & 0o077
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise UsageError(f"{where}: cannot be read: {error.strerror or error}") from None
     if is_open:
-        raise UsageError(f"{path}: others can read it; `chmod 600 {path}`")
+        raise UsageError(f"{where}: others can read it; `chmod 600 {path}`")
 
 
 def _make_folder(folder: Path) -> None:
+    """Raises UsageError, also where others can change what is in it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
+    if status.st_mode & 0o022:
+        raise UsageError(f"{folder}: others can write to it, and so give it other keys; `chmod 700 {folder}`")

@@ -25,6 +25,7 @@ from share.headset.certificate import (
 from share.headset.measures import HEADSET_TABLE, ServerReport, begin_table
 from share.headset.mounts import read_mounts
 from share.headset.page_requests import FOLDER
+from share.headset.session_ledger import SessionLedger
 from share.headset.wearers import EdgeAccess
 from share.net.http_guard import listen, served_address
 from share.net.transport import Address, parse_address
@@ -94,6 +95,7 @@ class HeadsetPage(ServedPage):
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
         table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
+        SessionLedger(default_folder())  # a damaged one is said before the page is served
         listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
@@ -101,12 +103,14 @@ class HeadsetPage(ServedPage):
         self.url = f"{self.scheme}://{shown}/"
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
+        self._has_keys = access.keys_folder is not None
         feed = ViewFeed(collect_s=COLLECT_S, has_images=False)
         settings = HeadsetSettings(
             access,
             where.host,
             self.certificate,
             session_key(default_folder()),
+            default_folder(),
             time.monotonic(),
             known_mounts,
             table,
@@ -120,6 +124,12 @@ class HeadsetPage(ServedPage):
         any thread."""
         fingerprint = None if self.certificate is None else self.certificate.fingerprint
         return {"address": self.url, "fingerprint": fingerprint, **self._report}
+
+    def shown_report(self, is_guarded: bool) -> dict[str, Any]:
+        """Return the report for readers. is_guarded: they have given a token. A code opens what its wearer's
+        key does, so with keys nobody else gets it."""
+        report = self.report()
+        return report | {"code": ""} if self._has_keys and not is_guarded else report
 
     def _hear(self, data: bytes) -> None:
         """Take what the process says."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from share.errors import UsageError
 from share.files.yaml_file import read_yaml
 
 MOUNT_FILE = "headset.yaml"
+MAX_AWAY_M, MAX_SHIFT_S = 2.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,21 @@ def read_mounts(given: Sequence[str]) -> dict[str, ViewerMount]:
 
 
 def _read(path: Path) -> ViewerMount:
-    section = read_yaml(path / MOUNT_FILE if path.is_dir() else path)
+    file = path / MOUNT_FILE if path.is_dir() else path
+    if not os.path.lexists(file):
+        raise UsageError(f"--mount: {file}: no such file; `share calibrate headset` makes it")
+    section = read_yaml(file)
     T = section.pose("T_body_viewer")
+    if (away_m := math.dist(T[:3, 3], (0, 0, 0))) > MAX_AWAY_M:
+        raise UsageError(
+            f"--mount: {file}: T_body_viewer: the device is {away_m:.3g} m from the eyes; at most "
+            f"{MAX_AWAY_M:g} m is a mount on a head"
+        )
     key = "timeshift_device_headset"
-    shift_ms = section.number(key) * 1e3 if key in section else None
-    return ViewerMount(tuple(T.ravel().tolist()), shift_ms)
+    shift_s = section.number(key) if key in section else None
+    if shift_s is not None and abs(shift_s) > MAX_SHIFT_S:
+        raise UsageError(
+            f"--mount: {file}: {key}: {shift_s:.3g} s; at most {MAX_SHIFT_S:g} s is the shift of clocks that "
+            "measure one motion"
+        )
+    return ViewerMount(tuple(T.ravel().tolist()), None if shift_s is None else shift_s * 1e3)

@@ -49,9 +49,14 @@ class Outbox:
     def put_robot(self, robot: dict[str, Any]) -> None:
         self._robots[robot["robot"]] = robot
 
+    def take_replies(self) -> list[dict[str, Any]]:
+        """Return the answers that wait."""
+        out, self._replies = self._replies, []
+        return out
+
     def take(self, now_s: float) -> list[dict[str, Any]]:
         """Return the messages to send now."""
-        out, self._replies = self._replies, []
+        out = self.take_replies()
         if self._objects or self._removed or self._has_all:
             removed = [{"id": key, "reason": reason} for key, reason in self._removed.items()]
             objects = list(self._objects.values())

@@ -1,4 +1,4 @@
-"""Who may use the headset page: a code of six digits lets one wearer in, a signed session lets it come back.
+"""Who may use the headset page: a code of eight digits lets one wearer in; by a signed session it comes back.
 
 The code is shown to the operator alone. It changes once it has been used, or after some wrong ones. A session
 says whose it is and when it ends, under a signature (HMAC, RFC 2104) that only this machine can make, so a
@@ -18,11 +18,11 @@ import msgspec
 
 from share.timing import TokenBucket, TokenBuckets
 
-CODE_DIGITS = 6
-MAX_WRONG = 10  # codes given, after which a new one is shown
+CODE_DIGITS = 8
+MAX_WRONG = 1000  # codes given, after which a new one is shown: fewer would let a stranger change it at will
 SESSION_S = 12 * 3600.0
 _ADDRESS_LIMIT = (3.0, 0.1)  # codes at once, and a second, of an address
-_LIMIT = (10.0, 0.2)  # of all together: a guess hits with 0.07 % in an hour
+_LIMIT = (20.0, 2.0)  # of all together, which twenty addresses use up: a guess hits with 0.007 % in an hour
 _MAX_ADDRESSES = 1024
 _SIGNATURE_BYTES = 16
 _MAX_SESSION_LENGTH = 1024  # characters
@@ -30,6 +30,10 @@ _MAX_SESSION_LENGTH = 1024  # characters
 
 class PairingError(Exception):
     """A wearer is not let in; the text is for it."""
+
+
+class SessionOverError(PairingError):
+    """A session is good no more; its page forgets it."""
 
 
 class WearerSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,8 +56,8 @@ def seal(key: bytes, session: WearerSession) -> str:
 
 
 def unseal(key: bytes, secret: str, now_s: float) -> WearerSession:
-    """Return the session of a secret. now_s: wall clock. Raises PairingError."""
-    unknown = PairingError("this session is not known here; pair again with the code of the edge")
+    """Return the session of a secret. now_s: wall clock. Raises SessionOverError."""
+    unknown = SessionOverError("this session is not known here; pair again with the code of the edge")
     if len(secret) > _MAX_SESSION_LENGTH:
         raise unknown
     try:
@@ -63,9 +67,12 @@ def unseal(key: bytes, secret: str, now_s: float) -> WearerSession:
     signature, payload = data[:_SIGNATURE_BYTES], data[_SIGNATURE_BYTES:]
     if not hmac.compare_digest(signature, _signature(key, payload)):
         raise unknown
-    session = _decoder.decode(payload)
+    try:
+        session = _decoder.decode(payload)
+    except msgspec.DecodeError:  # of another release
+        raise unknown from None
     if not now_s < session.end_s <= now_s + 2 * SESSION_S:
-        raise PairingError("this session is over; pair again with the code of the edge")
+        raise SessionOverError("this session is over; pair again with the code of the edge")
     return session
 
 

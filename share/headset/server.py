@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import gc
 import pickle
 import socket
 import threading
@@ -27,11 +28,13 @@ from share.headset.certificate import PageCertificate
 from share.headset.measures import MeasureTable, ServerReport, encode_report, measured_fields
 from share.headset.mounts import ViewerMount
 from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
-from share.headset.pairing import PairingError
+from share.headset.page_sending import CLOSE_S, end_page, has_left, refuse, send_all
+from share.headset.pairing import PairingError, SessionOverError
+from share.headset.session_ledger import SessionLedger
 from share.headset.shared_room import SharedRoom
-from share.headset.wearers import EdgeAccess, PageSeat, Wearer, WearerRegistry
+from share.headset.wearers import EdgeAccess, ListDamagedError, PageSeat, Wearer, WearerRegistry
 from share.net.bounded_websocket import (
-    HANDSHAKE_S,
+    BoundedListener,
     ModestSelector,
     PeerConnections,
     PeerLimits,
@@ -45,7 +48,7 @@ MAX_PAIRING, MAX_CONNECTIONS = 16, 100  # WebSockets that have not paired; conne
 # Of a page: files are asked for one by one; then it drags at 30 Hz, pings and measures.
 _LIMITS = PeerLimits(MAX_PAIRING, MAX_CONNECTIONS, 200, 100.0, 2**18, 2**17)
 SILENT_S = 6.0  # a page pings more often; one that does not has gone
-_HELLO_S, _SEND_S, _CLOSE_S = 5.0, 5.0, 1.0
+_HELLO_S = 5.0
 _REPORT_S, _PATH_S = 0.5, 1.0
 _BACKLOG = 128  # connections that the kernel holds; more would wait for seconds
 _UNSENT_BYTES = 2**16  # that wait in a page's connection before the newest is awaited
@@ -56,13 +59,15 @@ _MAX_MOVES = 32  # of maps, that a page was told
 @dataclass(frozen=True)
 class HeadsetSettings:
     """What the server is started with. certificate: None: plain HTTP, of this machine alone. host: that it
-    listens on. session_key: that signs sessions. began_s: when the page began, monotonic. table: where what
+    listens on. session_key: that signs sessions. sessions: the folder that says which ones
+    are the newest. began_s: when the page began, monotonic. table: where what
     pages measure is written. folder: with the page's files."""
 
     access: EdgeAccess
     host: str
     certificate: PageCertificate | None
     session_key: bytes = field(repr=False)
+    sessions: Path
     began_s: float
     mounts: dict[str, ViewerMount] = field(default_factory=dict)
     table: Path | None = None
@@ -73,18 +78,23 @@ class HeadsetServer:
     """Serves until the pipe ends. Raises ShareError, OSError."""
 
     def __init__(self, pipe: Connection, listener: socket.socket, settings: HeadsetSettings) -> None:
-        self._pipe, self._listener, self._settings = pipe, listener, settings
+        self._pipe, self._settings = pipe, settings
         certificate = settings.certificate
         self._tls = None if certificate is None else certificate.context()
         names = own_names(settings.host, () if certificate is None else certificate.names)
         self._guard = PageGuard("http" if certificate is None else "https", names, read_page(settings.folder))
         self._connections = PeerConnections(_LIMITS)
-        self._room, self._wearers = SharedRoom(), WearerRegistry(settings.access, settings.session_key)
+        self._listener = BoundedListener(listener, self._connections)
+        self._room = SharedRoom()
+        self._wearers = WearerRegistry(
+            settings.access, settings.session_key, SessionLedger(settings.sessions), self._notify
+        )
         self._table = MeasureTable(settings.table)
         self._path_due_s, self._code_shown = 0.0, ""
-        self._ended = asyncio.Event()
+        self._ended, self._tasks = asyncio.Event(), set[asyncio.Task[None]]()
 
     def run(self) -> None:
+        gc.freeze()  # what stays is not looked at again and again
         loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
         loop.set_exception_handler(lambda _loop, _context: None)  # anybody can cause failed handshakes
         loop.run_until_complete(self._serve())
@@ -93,13 +103,11 @@ class HeadsetServer:
         loop = asyncio.get_running_loop()
         server = await serve_bounded(
             self._serve_page,
-            self._connections,
-            sock=self._listener,
-            ssl=self._tls,
-            **({} if self._tls is None else {"ssl_handshake_timeout": HANDSHAKE_S}),
+            self._listener,
+            self._tls,
             max_size=page.MAX_PAGE_BYTES,
             write_limit=_UNSENT_BYTES,
-            close_timeout=_CLOSE_S,
+            close_timeout=CLOSE_S,
             process_request=self._answer,
         )
         self._listener.listen(_BACKLOG)
@@ -107,11 +115,39 @@ class HeadsetServer:
         while not self._ended.is_set():
             self._report()
             self._wearers.remove_absent(time.monotonic())
+            self._remove_unwanted()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_REPORT_S):
                     await self._ended.wait()
         self._wearers.close()
         server.close()
+
+    def _remove_unwanted(self) -> None:
+        """End pages whose session is over, or whose wearer has gone from the list of keys; one whose rights
+        have changed comes back and is told so."""
+        for wearer in self._wearers:
+            if (seat := wearer.seat) is None:
+                continue
+            try:
+                if self._wearers.rights_now(wearer) != seat.rights:
+                    seat.connection.transport.abort()
+            except ListDamagedError:
+                continue  # the edge says so itself
+            except PairingError as error:
+                self._dismiss(wearer, seat, error)
+
+    def _dismiss(self, wearer: Wearer, seat: PageSeat, error: PairingError) -> None:
+        """End a page, and what its wearer's robots do."""
+        self._tell(ServerReport(f"headset page: '{wearer.name}' has to go: {error}"))
+        wearer.stop_robots()
+        wearer.leave(seat)
+        self._end_page(seat, str(error), isinstance(error, SessionOverError))
+
+    def _end_page(self, seat: PageSeat, reason: str, is_over: bool) -> None:
+        """Refuse a page by and by: one that is dead does not hold up another."""
+        task = asyncio.create_task(end_page(seat, reason, is_over))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     # ------------------------------------------------------------------ the edge
 
@@ -178,6 +214,9 @@ class HeadsetServer:
             self._code_shown = desk.code
             self._tell(ServerReport(f"headset page: the code for the next wearer is {desk.code}"))
 
+    def _notify(self, line: str) -> None:
+        self._tell(ServerReport(line))
+
     # ------------------------------------------------------------------ requests
 
     def _answer(self, connection: Any, request: Any) -> Response | None:
@@ -206,23 +245,25 @@ class HeadsetServer:
             connection.transport.abort()
             return
         except (PairingError, page.MessageError) as error:
-            await _refuse(connection, str(error))
+            await refuse(connection, str(error), isinstance(error, SessionOverError))
             return
         self._connections.leave(connection)  # its place is its own from now on
-        seat, taken_over = PageSeat(connection), wearer.seat
+        seat, taken_over = PageSeat(connection, rights), wearer.seat
         seat.reply(self._welcome(wearer, secret, rights))
         wearer.sit(seat)
         seat.outbox.put_poses(self._room.poses())
-        sender = asyncio.create_task(_send(seat))
+        sender = asyncio.create_task(send_all(seat))
         try:
             if taken_over is not None:
-                await _refuse(taken_over.connection, f"another page goes on as '{wearer.name}'")
+                self._end_page(taken_over, f"another page goes on as '{wearer.name}'", True)
             await self._read(wearer, seat)
         except page.MessageError as error:
             sender.cancel()
-            await _refuse(connection, str(error))
-        except (TimeoutError, ConnectionClosed):
+            await refuse(connection, str(error))
+        except (TimeoutError, ConnectionClosed) as error:
             connection.transport.abort()
+            if wearer.seat is seat and (isinstance(error, TimeoutError) or has_left(error)):
+                wearer.stop_robots()
         finally:
             sender.cancel()
             wearer.leave(seat)
@@ -273,7 +314,21 @@ class HeadsetServer:
                 case page.PageHello():
                     raise page.MessageError("a page says hello once")
                 case wish:
-                    wearer.ask(wish)
+                    self._ask(wearer, seat, wish)
+
+    def _ask(self, wearer: Wearer, seat: PageSeat, wish: page.PageRequest | page.PageCommand) -> None:
+        """Do what a page wants, if its wearer may still be here."""
+        if wearer.seat is not seat:
+            return  # another page has taken over, or its wearer had to go
+        try:
+            self._wearers.rights_now(wearer)
+        except ListDamagedError:
+            pass  # the edge answers
+        except PairingError as error:
+            wearer.refuse(wish, str(error))
+            self._dismiss(wearer, seat, error)
+            return
+        wearer.ask(wish)
 
     def _send_points(self, seat: PageSeat, map_id: str) -> None:
         points = self._room.points(map_id)
@@ -305,29 +360,3 @@ def _tell_move(wearer: Wearer, seat: PageSeat, move: Any) -> None:
         return
     T = move.T_new_old.ravel().tolist()
     seat.reply({"type": "map_changed", "old": move.old, "new": move.new, "T_new_old": T})
-
-
-async def _send(seat: PageSeat) -> None:
-    """Send what there is as it comes; a page that does not read is disconnected."""
-    try:
-        while not seat.outbox.is_overfull:
-            for message in seat.outbox.take(time.monotonic()):
-                async with asyncio.timeout(_SEND_S):
-                    await seat.connection.send(page.encode_page(message))
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(seat.outbox.wait_s(time.monotonic())):
-                    await seat.wake.wait()
-            seat.wake.clear()
-    except ConnectionClosed:
-        return
-    except TimeoutError:
-        pass
-    seat.connection.transport.abort()
-
-
-async def _refuse(connection: Any, reason: str) -> None:
-    with contextlib.suppress(TimeoutError, ConnectionClosed):
-        async with asyncio.timeout(_CLOSE_S):
-            await connection.send(page.encode_page({"type": "refused", "reason": reason}))
-            await connection.close(1008)
-    connection.transport.abort()

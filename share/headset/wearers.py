@@ -7,11 +7,12 @@ import secrets
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from share.agent_names import checked_name
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.headset.outbox import Outbox
 from share.headset.page_messages import (
     PageCancel,
@@ -21,19 +22,24 @@ from share.headset.page_messages import (
     PageMeasured,
     PageRequest,
 )
-from share.headset.pairing import SESSION_S, PairingDesk, PairingError, WearerSession, seal, unseal
+from share.headset.pairing import PairingDesk, PairingError, SessionOverError, WearerSession, seal, unseal
+from share.headset.session_ledger import SessionLedger
 from share.headset.wearer_link import Tell, WearerLink, refusal_of
-from share.net.keys import AgentKeys, allow_list
+from share.net.keys import AgentKeys, AllowList, allow_list
 from share.net.lent_keys import LentKeys
 from share.timing import TokenBucket, TokenBuckets
 from share.wire.room_messages import Permission
 
 MAX_WEARERS = 8
 ABSENT_S = 6.0  # a page that is away for longer commands no robot: what it sent stops
-_MAX_KNOWN = 256  # names whose newest session is remembered
+_END_S = 3.0  # after that its client of the edge ends, which has told the robots by then
 _POINTS_LIMIT = (2.0, 0.5)  # times that a page is sent the points of a map, at once and a second
 _COMMAND_LIMIT = (5.0, 2.0)  # goals of a page, and as many stops, at once and a second
 _MAX_COMMANDS = 16  # of a wearer, whose state is told again to a page that comes back
+
+
+class ListDamagedError(PairingError):
+    """The edge's list of keys cannot be read: who is on it is not known now."""
 
 
 @dataclass(frozen=True)
@@ -47,31 +53,38 @@ class EdgeAccess:
     edge_key: str = ""
     secret: bytes = field(default=b"", repr=False)
 
+    @cached_property
+    def _list(self) -> AllowList | None:
+        return None if self.keys_folder is None else allow_list(self.keys_folder)
+
     def rights_of(self, name: str) -> frozenset[Permission]:
-        """Return what a wearer may do. Raises PairingError if the edge does not know the name."""
-        if self.keys_folder is None:
+        """Return what a wearer may do, as the list says now. Raises PairingError if it does not have the
+        name, ListDamagedError if it cannot be read."""
+        if self._list is None:
             return self.permissions
         try:
-            rights = allow_list(self.keys_folder).rights()
+            rights = self._list.rights()
         except UsageError as error:
-            raise PairingError(f"the edge's list of keys: {error}") from None
+            raise ListDamagedError(f"the edge's list of keys cannot be used: {error}"[:300]) from None
         if name not in rights:
             raise PairingError(
-                f"the edge's list has no agent '{name}'; on it run: share keys authorize {name} …, or use a "
-                "name that it has"
+                f"the edge's list of keys has no agent '{name}'; on the edge's machine, with the public key "
+                f"of the device of '{name}': share keys authorize {name} {name}.public"
             )
         return rights[name]
 
     def keys_of(self, name: str) -> AgentKeys | None:
         if self.keys_folder is None:
             return None
-        return AgentKeys(LentKeys(self.secret).pair(name), self.edge_key)
+        return AgentKeys(LentKeys(self.secret).pair(name), self.edge_key, is_lent=True)
 
 
 class PageSeat:
-    """One page that is connected as a wearer. wake: set when there is something to send."""
+    """One page that is connected as a wearer. rights: that it was told. wake: set when there is something to
+    send."""
 
-    def __init__(self, connection: Any) -> None:
+    def __init__(self, connection: Any, rights: frozenset[Permission]) -> None:
+        self.rights = rights
         self.connection, self.outbox, self.wake = connection, Outbox(), asyncio.Event()
         self.points_limit, self._command_limits = TokenBucket(*_POINTS_LIMIT), TokenBuckets(*_COMMAND_LIMIT)
 
@@ -129,11 +142,26 @@ class Wearer:
         if self.seat is seat:
             self.seat, self.left_s = None, time.monotonic()
 
+    def stop_robots(self) -> None:
+        """Stop the robots that drive by this wearer's goals: nobody is there to stop them."""
+        goals = [(goal, state) for goal, state in self._commands.values() if isinstance(goal, PageGoto)]
+        open_ones = [goal for goal, state in goals if state is None or not state["is_final"]]
+        for robot in dict.fromkeys(goal.robot for goal in open_ones):
+            self._link.ask(PageCancel(0, robot))
+        for goal in open_ones:
+            text = "stopped: its wearer was away"
+            about = {"command": goal.command, "robot": goal.robot, "commander": self.name, "text": text}
+            state = {"type": "command", **about, "is_final": True, "is_reached": False}
+            self._commands[goal.command] = goal, state
+
+    def refuse(self, wish: PageRequest | PageCommand, reason: str) -> None:
+        self._reply(refusal_of(wish, reason, self.name))
+
     def ask(self, wish: PageRequest | PageCommand) -> None:
         """Do what the page wants, or answer why not. A command that it repeats is the same one."""
         if isinstance(wish, PageGoto | PageCancel):
             if self.seat is not None and not self.seat.takes(wish):
-                self._reply(refusal_of(wish, "too many commands at once", self.name))
+                self.refuse(wish, "too many commands at once")
                 return
             known, state = self._commands.get(wish.command, (None, None))
             if known == wish:
@@ -171,7 +199,9 @@ class Wearer:
                 if kind == "edge":
                     self._edge = message
                 elif kind == "command" and message["command"] in self._commands:
-                    wish, _ = self._commands[message["command"]]
+                    wish, state = self._commands[message["command"]]
+                    if state is not None and state["is_final"]:
+                        return
                     self._commands[message["command"]] = wish, message
                 self._reply(message)
         if self.seat is not None:
@@ -197,13 +227,16 @@ def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *argum
 
 
 class WearerRegistry:
-    """Lets wearers in. key: that sessions are signed with."""
+    """Lets wearers in. key: that sessions are signed with. ledger: of the newest ones. notify: is called with
+    a line for the operator."""
 
-    def __init__(self, access: EdgeAccess, key: bytes) -> None:
+    def __init__(
+        self, access: EdgeAccess, key: bytes, ledger: SessionLedger, notify: Callable[[str], None]
+    ) -> None:
         self.desk = PairingDesk(secrets.randbelow)
         self._access, self._key = access, key
         self._wearers: dict[str, Wearer] = {}
-        self._nonces: dict[str, str] = {}  # of the newest session of each name
+        self._ledger, self._notify = ledger, notify
 
     def __iter__(self) -> Any:
         return iter(list(self._wearers.values()))
@@ -212,8 +245,8 @@ class WearerRegistry:
         """Return the wearer of a hello, its session's secret and its rights. Raises PairingError."""
         if hello.session is not None:
             session = unseal(self._key, hello.session, time.time())
-            if self._nonces.get(session.name, session.nonce) != session.nonce:
-                raise PairingError(f"another headset has paired as '{session.name}' since; pair again")
+            if not self._ledger.is_newest(session):
+                raise SessionOverError(f"another headset has paired as '{session.name}' since; pair again")
             rights = self._access.rights_of(session.name)
         else:
             session, rights = self._pair(hello, address)
@@ -240,15 +273,18 @@ class WearerRegistry:
         if wearer is None and len(self._wearers) >= MAX_WEARERS:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
         self.desk.renew()
-        return WearerSession(name, agent, time.time() + SESSION_S, secrets.token_urlsafe(12)), rights
+        end_s = self._ledger.end_of_new(name, time.time())
+        return WearerSession(name, agent, end_s, secrets.token_urlsafe(12)), rights
 
     def _add(self, session: WearerSession) -> Wearer:
         if len(self._wearers) >= MAX_WEARERS:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
-        self._nonces.pop(session.name, None)
-        self._nonces[session.name] = session.nonce
-        while len(self._nonces) > _MAX_KNOWN:
-            del self._nonces[next(iter(self._nonces))]
+        try:
+            self._ledger.note(session, time.time())
+        except (ShareError, OSError) as error:
+            self._notify(
+                f"headset page: {error}: after a start of the edge, sessions that are over may be good again"
+            )
         name, access = session.name, self._access
         wearer = Wearer(session, lambda tell: WearerLink(access.address, name, access.keys_of(name), tell))
         self._wearers[name] = wearer
@@ -260,10 +296,21 @@ class WearerRegistry:
         wearer.end()
 
     def remove_absent(self, now_s: float) -> None:
-        """End the clients of wearers whose page is away too long; their sessions stay."""
+        """Stop the robots of wearers whose page is away too long, and end their clients; their sessions
+        stay."""
         for wearer in self:
-            if wearer.seat is None and now_s - wearer.left_s > ABSENT_S:
+            away_s = now_s - wearer.left_s if wearer.seat is None else 0.0
+            if away_s > ABSENT_S:
+                wearer.stop_robots()
+            if away_s > ABSENT_S + _END_S:
                 self.remove(wearer)
+
+    def rights_now(self, wearer: Wearer) -> frozenset[Permission]:
+        """Return what a wearer may do by now. Raises PairingError if it may be here no more, ListDamagedError
+        where that is not known."""
+        if time.time() >= wearer.session.end_s:
+            raise SessionOverError("this session is over; pair again with the code of the edge")
+        return self._access.rights_of(wearer.name)
 
     def close(self) -> None:
         """End the clients of all."""

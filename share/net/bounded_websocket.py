@@ -1,15 +1,18 @@
 """WebSocket connections that cannot cost their server much, for `websockets.asyncio.server.serve`.
 
-A connection counts from its TCP handshake on, not from its first message. What waits too long, or sends more
-than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets that of one
-that has long had it: who reads for ever cannot be told apart from who only holds a place. Some places may
-be kept for programs of the server's own machine.
+A connection counts from its `accept()` on, before TLS, not from its first message. What waits too long, or
+sends more than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets
+that of one that has long had it: who reads for ever cannot be told apart from who only holds a place. Some
+places may be kept for programs of the server's own machine.
 """
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import logging
 import selectors
+import socket
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -23,7 +26,9 @@ from websockets.asyncio.server import ServerConnection, serve
 from share.timing import TokenBucket
 
 BACKLOG = 16  # that many are accepted at once
-HANDSHAKE_S = 5.0  # from the connection to the request's end
+HANDSHAKE_S = 5.0  # from the connection, or the end of TLS's handshake, to the request's end
+TLS_S = 2.0  # for TLS's handshake, and for its end
+_COLLECTED = 64  # connections: asyncio leaves the 256 kB of each unfinished TLS to the garbage collector
 SURE_S = 60.0  # that a place is its holder's, except that an address with more gives it to one with fewer
 PING_S = 10.0  # between PINGs, and until their answer: who gives none is disconnected
 _MAX_SLEEP_S = 0.1
@@ -32,8 +37,9 @@ _MAX_SLEEP_S = 0.1
 @dataclass(frozen=True)
 class PeerLimits:
     """max_open: connections served at once (`place_to_free`). max_waiting: before they are let in, or on
-    their way out; one more closes the oldest. A peer may send `burst` frames and `burst_bytes` at once, and
-    more by and by (per s). kept_open: of max_open, for peers of the server's own machine."""
+    their way out; one more closes the oldest of the address with the most. A peer may send `burst` frames and
+    `burst_bytes` at once, and more by and by (per s). kept_open: of max_open, for peers of the server's own
+    machine."""
 
     max_open: int
     max_waiting: int
@@ -65,26 +71,38 @@ class PeerConnections:
 
     def __init__(self, limits: PeerLimits) -> None:
         self.limits = limits
-        self._waiting: dict[BoundedConnection, None] = {}  # oldest first
+        self._waiting: dict[AcceptedSocket, None] = {}  # oldest first
         self._open: dict[BoundedConnection, float] = {}  # since when, monotonic s
 
     @property
     def open_count(self) -> int:
         return len(self._open)
 
-    def arrive(self, connection: BoundedConnection) -> None:
+    def arrive(self, accepted: AcceptedSocket) -> None:
+        """Count a socket that was just accepted, at the cost of another if need be."""
         if len(self._waiting) >= self.limits.max_waiting:
-            oldest = next(iter(self._waiting))
+            counts = Counter(one.address for one in self._waiting)
+            most = max(counts.values())
+            oldest = next(one for one in self._waiting if counts[one.address] == most)
             del self._waiting[oldest]
-            oldest.transport.abort()
-        self._waiting[connection] = None
+            oldest.end()
+        self._waiting[accepted] = None
+
+    def take_up(self, connection: BoundedConnection) -> None:
+        """Join a connection, whose TLS is there, to its socket."""
+        number = connection.transport.get_extra_info("socket").fileno()
+        connection.accepted = next((one for one in self._waiting if one.fileno() == number), None)
+        if connection.accepted is None:  # its place went to another meanwhile
+            connection.transport.abort()
+        else:
+            connection.accepted.connection = connection
 
     def admit(self, connection: Any) -> bool:
         """Let a connection in, at the cost of another if need be. Return whether there is room."""
         if connection not in self._open:
             if not self._has_room(connection) and not self._free_place(connection):
                 return False
-            self._waiting.pop(connection, None)
+            self.forget(connection.accepted)
             self._open[connection] = time.monotonic()
         return True
 
@@ -110,33 +128,83 @@ class PeerConnections:
         return True
 
     def leave(self, connection: BoundedConnection) -> None:
-        self._waiting.pop(connection, None)
+        self.forget(connection.accepted)
         self._open.pop(connection, None)
+
+    def forget(self, accepted: AcceptedSocket | None) -> None:
+        """Count a socket no longer as one that waits."""
+        if accepted is not None:
+            self._waiting.pop(accepted, None)
 
     def abort_all(self) -> None:
         """Close every connection at once."""
-        for connection in [*self._waiting, *self._open]:
+        for accepted in list(self._waiting):
+            accepted.end()
+        for connection in list(self._open):
             connection.transport.abort()
+
+
+class AcceptedSocket(socket.socket):
+    """A socket that counts as waiting until its connection is let in, or it is closed."""
+
+    def __init__(self, plain: socket.socket, connections: PeerConnections) -> None:
+        peer, own = _names(plain)
+        self.address, self.is_local = _holder_of(peer), _is_own_machine(peer, own)
+        self.connection: BoundedConnection | None = None  # once TLS is there
+        self._peer_connections = connections
+        super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
+
+    def end(self) -> None:
+        """Close it at once, or let its owner do so, who finds it at its end."""
+        if self.connection is not None:
+            self.connection.transport.abort()
+        else:
+            with contextlib.suppress(OSError):  # its peer was faster
+                self.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._peer_connections.forget(self)
+        super().close()
+
+
+class BoundedListener(socket.socket):
+    """A listener in the place of another, whose sockets are counted by `PeerConnections` as they are
+    accepted."""
+
+    def __init__(self, listener: socket.socket, connections: PeerConnections) -> None:
+        self.connections, self.is_collected, self._count = connections, False, 0
+        super().__init__(listener.family, listener.type, listener.proto, fileno=listener.detach())
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        plain, address = super().accept()
+        accepted = AcceptedSocket(plain, self.connections)
+        self.connections.arrive(accepted)
+        self._count += 1
+        if self.is_collected and self._count % _COLLECTED == 0:
+            gc.collect()
+        return accepted, address
 
 
 class BoundedConnection(ServerConnection):  # type: ignore[misc]
     """A connection counted by `PeerConnections`.
 
-    Given as `create_connection=partial(BoundedConnection, connections=connections)`.
+    Given as `create_connection=partial(BoundedConnection, connections=connections)`, to a server whose socket
+    is a `BoundedListener`.
     """
 
     def __init__(self, *args: Any, connections: PeerConnections, **options: Any) -> None:
         super().__init__(*args, **options)
         limits, self.address, self.is_local = connections.limits, "", False
+        self.accepted: AcceptedSocket | None = None
         self._peer_connections = connections
         self._frames = TokenBucket(limits.burst, limits.frames_per_s)
         self._bytes = TokenBucket(limits.burst_bytes, limits.bytes_per_s)
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        peer, own = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
-        self.address, self.is_local = _holder_of(peer), _is_own_machine(peer, own)
-        self._peer_connections.arrive(self)
+        self._peer_connections.take_up(self)
+        if self.accepted is not None:
+            self.address, self.is_local = self.accepted.address, self.accepted.is_local
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._peer_connections.leave(self)
@@ -153,6 +221,13 @@ class BoundedConnection(ServerConnection):  # type: ignore[misc]
             super().process_event(event)
         else:
             self.transport.abort()
+
+
+def _names(plain: socket.socket) -> tuple[Any, Any]:
+    """Return the addresses of a socket's peer and its own; None of one that has gone."""
+    with contextlib.suppress(OSError):
+        return plain.getpeername(), plain.getsockname()
+    return None, None
 
 
 def _holder_of(peer: Any) -> str:
@@ -182,21 +257,26 @@ class ModestSelector(selectors.DefaultSelector):
         return super().select(timeout)
 
 
-def serve_bounded(handler: Any, connections: PeerConnections, **options: Any) -> serve:
-    """Return a server whose connections are bounded by `connections`, not compressed, and pinged.
+def serve_bounded(handler: Any, listener: BoundedListener, ssl: Any = None, **options: Any) -> serve:
+    """Return a server whose connections are bounded, not compressed, and pinged.
 
-    options: the others of `websockets.asyncio.server.serve`.
+    ssl: a TLS context, or None. options: the others of `websockets.asyncio.server.serve`.
     """
+    listener.is_collected = ssl is not None
+    tls_times = {} if ssl is None else {"ssl_handshake_timeout": TLS_S, "ssl_shutdown_timeout": TLS_S}
     logger = logging.Logger("share.websocket")
     logger.addHandler(logging.NullHandler())  # anybody can cause failed handshakes
     return serve(
         handler,
+        sock=listener,
+        ssl=ssl,
         backlog=BACKLOG,
         compression=None,
         open_timeout=HANDSHAKE_S,
         ping_interval=PING_S,
         ping_timeout=PING_S,
-        create_connection=partial(BoundedConnection, connections=connections),
+        create_connection=partial(BoundedConnection, connections=listener.connections),
         logger=logger,
+        **tls_times,
         **options,
     )

@@ -43,10 +43,12 @@ class KeyPair:
 
 @dataclass(frozen=True)
 class AgentKeys:
-    """Keys of an agent: its own pair and the public key of its edge."""
+    """Keys of an agent: its own pair and the public key of its edge. is_lent: the edge made the pair, for a
+    name of its list."""
 
     own: KeyPair
     edge: str
+    is_lent: bool = False
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class AllowList:
         self.path, self.public_key_of = path, public_key_of
         self._cached: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
         self._lent: tuple[dict[str, Grant], dict[str, Grant]] = {}, {}  # of which grants, by lent key
+        self._was_lent: dict[str, str] = {}  # names that the list has had, by lent key
 
     def names_by_key(self) -> dict[str, str]:
         """Return machine names by public key. Raises UsageError if the file is unreadable or malformed."""
@@ -96,6 +99,7 @@ class AllowList:
                 if self._lent[0] is not grants:  # the file is another
                     rights, key_of = self.rights().items(), self.public_key_of
                     self._lent = grants, {key_of(name): Grant(name, (name,), may) for name, may in rights}
+                    self._was_lent |= {key: grant.name for key, grant in self._lent[1].items()}
                 grants = self._lent[1]
         except UsageError:
             grants = {}
@@ -119,6 +123,13 @@ class AllowList:
     def is_allowed(self, public: str) -> bool:
         """Return whether that key may connect; False while the file is unreadable."""
         return bool(self.agents_for(public))
+
+    def refusal(self, public: str, address: str) -> str:
+        """Return what is said of a key that may not connect, and what to do."""
+        if (name := self._was_lent.get(public)) is not None:  # nobody has that key in a file
+            return f"a client of '{name}' ({address}): the list has no agent of that name any more"
+        what = f"the key '{public}' ({address}) is not authorized"
+        return f"{what}; to authorize it: share keys authorize NAME '{public}'"
 
     def trouble(self) -> str | None:
         """Return why no key may connect; None if the file is readable."""

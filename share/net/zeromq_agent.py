@@ -178,6 +178,8 @@ class ZmqAgentLink:
             return "the edge requires keys; give its public key with --server-key"
         if failure == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             own = self._keys.own
+            if self._keys.is_lent:
+                return f"the edge's list of keys has no agent '{own.name}' any more, or is damaged"
             command = f"share keys authorize {own.name} '{own.public}'"
             return f"the edge does not know this key; on the edge's machine: {command}"
         return "the edge has another key than --server-key, or none"

@@ -250,9 +250,5 @@ class ZapAuthenticator:
                 return [version, number, b"300", b"blocked", b"", b""]
             self._admitted_keys.add(key)  # a revocation meanwhile is found by the next `has_revoked`
             return [version, number, b"200", b"", key.encode(), b""]
-        self._refusals.append(
-            self.trouble()
-            or f"the key '{key}' ({address.decode()}) is not authorized; "
-            f"to authorize it: share keys authorize NAME '{key}'"
-        )
+        self._refusals.append(self.trouble() or self._allowed.refusal(key, address.decode()))
         return [version, number, b"400", b"not authorized", b"", b""]

@@ -206,7 +206,12 @@ class PoseWebSocket:
         notify: Callable[[str], None] = _print_error,
     ) -> None:
         try:
-            from share.net.bounded_websocket import ModestSelector, PeerConnections, PeerLimits
+            from share.net.bounded_websocket import (
+                BoundedListener,
+                ModestSelector,
+                PeerConnections,
+                PeerLimits,
+            )
         except ImportError:
             raise ShareError(install_hint("websockets", "websocket")) from None
         if bad := [one for one in origins if not re.fullmatch(r"https?://[^/\s]+", one)]:
@@ -221,13 +226,14 @@ class PoseWebSocket:
         self._notify = notify
         family = socket.AF_INET6 if ":" in host.name else socket.AF_INET
         try:
-            self._listener = socket.create_server((host.name, host.port), family=family)
+            listener = socket.create_server((host.name, host.port), family=family)
         except OSError as error:
             raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
-        self.host = HostPort(host.name, int(self._listener.getsockname()[1]))
+        self.host = HostPort(host.name, int(listener.getsockname()[1]))
         # a page's request has some kB; a reader then sends an answer to a ping now and then
         limits = PeerLimits(MAX_READERS, _MAX_WAITING, 20, 2.0, 2**14, 2**10, OWN_READERS)
         self.peer_connections = PeerConnections(limits)
+        self._listener = BoundedListener(listener, self.peer_connections)
         self._loop = asyncio.SelectorEventLoop(ModestSelector(_SLEEP_RATIO))
         self._loop.set_exception_handler(self._take_loop_error)
         self._new_message = asyncio.Event()  # replaced at each message
@@ -269,8 +275,7 @@ class PoseWebSocket:
 
         server = await serve_bounded(
             self._serve_reader,
-            self.peer_connections,
-            sock=self._listener,
+            self._listener,
             origins=self._allowed,
             max_size=_MAX_RECEIVED_BYTES,
             write_limit=_UNSENT_BYTES,

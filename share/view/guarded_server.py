@@ -16,7 +16,14 @@ import msgspec
 from msgspec import Meta, Struct
 
 from share.errors import ShareError
-from share.net.bounded_websocket import BACKLOG, HANDSHAKE_S, BoundedConnection, PeerConnections, PeerLimits
+from share.net.bounded_websocket import (
+    BACKLOG,
+    HANDSHAKE_S,
+    BoundedConnection,
+    BoundedListener,
+    PeerConnections,
+    PeerLimits,
+)
 from share.net.http_guard import HttpGuard
 
 _MAX_MESSAGE_BYTES = 2**14  # from a browser, which sends its camera and what is chosen
@@ -53,7 +60,7 @@ def guarded_serving(listener: socket.socket, guard: HttpGuard) -> Iterator[None]
             "open_timeout": HANDSHAKE_S,
             "create_connection": partial(_BrowserConnection, connections=connections),
         }
-        return original(handler, sock=listener, **options | ours)
+        return original(handler, sock=BoundedListener(listener, connections), **options | ours)
 
     server.serve = serve
     try:

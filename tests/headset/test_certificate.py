@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import ssl
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import UsageError
-from share.headset.certificate import given_certificate, own_certificate, session_key
+from share.headset.certificate import _key_fault, given_certificate, own_certificate, session_key
 
 needs_cryptography = pytest.mark.skipif(
     subprocess.run([sys.executable, "-c", "import cryptography"], capture_output=True).returncode != 0,
@@ -52,6 +53,7 @@ def test_a_given_one_that_is_none_is_one_line(tmp_path: Path) -> None:
     own, other = (own_certificate(tmp_path / name, "::1") for name in "ab")
     assert given_certificate(own.certificate, own.key) == own
     (tmp_path / "text").write_text("x")
+    (tmp_path / "text").chmod(0o600)
     for certificate, key, said in (
         (own.certificate, other.key, "--headset-key .*is not the key of this certificate"),
         (own.certificate, tmp_path / "text", "--headset-key .*is no key"),
@@ -62,6 +64,56 @@ def test_a_given_one_that_is_none_is_one_line(tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError, match=said):
             given_certificate(certificate, key)
+
+
+@needs_cryptography
+def test_a_key_is_refused_for_what_it_is(tmp_path: Path) -> None:
+    from cryptography.hazmat.primitives.asymmetric import ec, rsa
+    from cryptography.hazmat.primitives.serialization import (
+        BestAvailableEncryption,
+        Encoding,
+        NoEncryption,
+        PrivateFormat,
+    )
+
+    own = own_certificate(tmp_path / "a", "::1")
+    made = rsa.generate_private_key(65537, 2048), ec.generate_private_key(ec.SECP256R1())
+    for key, lock, said in (
+        (made[0], NoEncryption(), "is a key of another kind than the certificate's"),
+        (made[1], NoEncryption(), "is not the key of this certificate"),
+        (made[1], BestAvailableEncryption(b"x"), "has a password"),
+    ):
+        path = tmp_path / "key"
+        path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, lock))
+        path.chmod(0o600)
+        with pytest.raises(UsageError, match=f"--headset-key .*: {said}"):
+            given_certificate(own.certificate, path)
+    own.key.chmod(0o644)
+    with pytest.raises(UsageError, match=r"--headset-key .*: others can read it; `chmod 600"):
+        given_certificate(own.certificate, own.key)
+
+
+def test_openssls_reasons_are_told() -> None:
+    for reason, said in (("EE_KEY_TOO_SMALL", "too short"), ("CA_MD_TOO_WEAK", "OpenSSL .*: ca md too weak")):
+        error = ssl.SSLError()
+        error.reason = reason
+        assert re.search(said, _key_fault(error, b""))
+
+
+@needs_cryptography
+def test_a_damaged_own_one_says_how_to_get_another(tmp_path: Path) -> None:
+    own = own_certificate(tmp_path, "::1")
+    for path in (own.key, own.certificate):
+        before = path.read_bytes()
+        path.write_bytes(before[:60])
+        with pytest.raises(UsageError, match=rf"{path}: is no .*; remove it, and one is made"):
+            own_certificate(tmp_path, "::1")
+        path.write_bytes(before)
+    assert own_certificate(tmp_path, "::1") == own
+    tmp_path.chmod(0o777)
+    for make in (session_key, lambda folder: own_certificate(folder, "::1")):
+        with pytest.raises(UsageError, match=r"others can write to it.*chmod 700"):
+            make(tmp_path)
 
 
 @needs_cryptography

@@ -24,6 +24,7 @@ from share.headset.headset_page import HeadsetPage, local_address, page_address
 from share.headset.page_messages import PageMeasured
 from share.headset.wearers import EdgeAccess
 from share.mapping.loops import KeyframeKey
+from share.net.keys import authorize, generate_pair, revoke
 from share.net.transport import Address
 from share.protocol.room_events import MessageWanted, RobotCommanded
 from share.runtime.room_link import RoomLink
@@ -108,6 +109,10 @@ def test_two_wearers_see_one_object_and_its_owner(fresh: HeadsetPage, edge: Room
         assert {one["name"] for one in edge.edge.room.report()["clients"]} >= {"ann", "bob"}
 
 
+def test_without_keys_the_code_is_for_every_program_of_the_machine(served: HeadsetPage) -> None:
+    assert served.shown_report(is_guarded=False)["code"] == code(served) != ""
+
+
 def test_the_page_learns_the_servers_clock(fresh: HeadsetPage) -> None:
     with paired(fresh, "ann") as ann:
         before_ms = time.monotonic_ns() / 1e6
@@ -122,14 +127,19 @@ def test_nothing_is_said_before_a_code(fresh: HeadsetPage) -> None:
         with pytest.raises(TimeoutError):
             stranger.hear(0.5)
         stranger.send(type="ping", n=1, sent_ms=0)
-        assert stranger.hear() == {"type": "refused", "reason": "a page begins with hello"}
+        assert stranger.hear() == {
+            "type": "refused",
+            "reason": "a page begins with hello",
+            "is_over": False,
+        }
         assert stranger.is_closed()
     used = code(fresh)
     paired(fresh, "ann").close()
     for wrong in ({"code": used, "name": "bob"}, {"session": "A" * 64}):  # replayed; forged
         with PageClient(fresh.endpoint) as stranger:
             answer = stranger.hello(**wrong)
-            assert answer["type"] == "refused" and list(answer) == ["type", "reason"]
+            assert answer["type"] == "refused" and list(answer) == ["type", "reason", "is_over"]
+            assert answer["is_over"] == ("session" in wrong)
             assert stranger.is_closed() and len(stranger.seen) == 1
     assert code(fresh) != used
 
@@ -202,7 +212,7 @@ class Bridge(threading.Thread):
         super().__init__()
         self._link = RoomLink(address, "tb", drives_robot=True)
         self.goals: list[tuple[float, Goto]] = []  # with when
-        self._is_ended = False
+        self._is_ended, self.stops = False, 0
 
     def __enter__(self) -> Bridge:
         self.start()
@@ -227,6 +237,7 @@ class Bridge(threading.Thread):
     def _obey(self, command: Goto | Cancel) -> None:
         if is_stop := isinstance(command, Cancel):
             self.goals.clear()
+            self.stops += 1
         else:
             self.goals.append((time.monotonic(), command))
         text = "stopped" if is_stop else "drives"
@@ -266,13 +277,110 @@ def test_a_page_that_is_silent_is_let_go_and_its_robot_stops(fresh: HeadsetPage,
     with Bridge(edge.address) as tb, paired(fresh, "ann", keeps_alive=False) as ann:
         began = time.monotonic()
         ann.send(type="goto", command=1, robot=None, map_id=None, x=1.5, y=2, yaw=None)
+        assert soon(lambda: tb.is_told(within_s=2.0))
         assert ann.is_closed() and time.monotonic() - began > 4.0
-        assert tb.is_told(within_s=5.0)
-        assert soon(lambda: "ann" not in fresh.report()["wearers"])
-        assert soon(lambda: not tb.is_told(within_s=2.0))
+        assert soon(lambda: tb.stops == 1, within_s=5.0)  # it is told so, and nothing after that
         with PageClient(fresh.endpoint) as again:  # its session is good all the same
             assert again.hello(session=ann.seen[0]["session"])["type"] == "welcome"
-        assert not tb.is_told(within_s=2.0)
+            state = again.wait("command", lambda m: m["command"] == 1)
+            assert state["is_final"] and "was away" in state["text"]
+        assert not tb.goals
+        assert soon(lambda: "ann" not in fresh.report()["wearers"])
+
+
+@pytest.mark.slow
+def test_a_tab_that_is_closed_stops_its_robot_at_once_a_gap_does_not(
+    fresh: HeadsetPage, edge: RoomServer
+) -> None:
+    with Bridge(edge.address) as tb:
+        ann = paired(fresh, "ann")
+        session = ann.seen[0]["session"]
+        ann.send(type="goto", command=1, robot=None, map_id=None, x=1.5, y=2, yaw=None)
+        assert soon(lambda: tb.is_told(within_s=2.0))
+        ann.socket.socket.shutdown(socket.SHUT_RDWR)  # as where the network has gone
+        ann.close()
+        time.sleep(3.0)
+        assert tb.is_told(within_s=2.0) and not tb.stops
+        with PageClient(fresh.endpoint) as again:
+            assert again.hello(session=session)["type"] == "welcome"
+        assert soon(lambda: tb.stops == 1, within_s=3.0) and not tb.goals
+
+
+def raw_page(endpoint: str, **hello: Any) -> socket.socket:
+    """A page that says hello, and then neither reads nor answers a close."""
+    host, port = endpoint.split(":")
+    raw = socket.create_connection((host, int(port)), 10)
+    names = f"Host: {endpoint}\r\nOrigin: http://{endpoint}\r\nUpgrade: websocket\r\nConnection: Upgrade"
+    key = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13"
+    raw.sendall(f"GET /room HTTP/1.1\r\n{names}\r\n{key}\r\n\r\n".encode())
+    data = json.dumps({"type": "hello", "schema": 1, **hello}).encode()
+    head = bytes([0x81]) + (bytes([0x80 | len(data)]) if len(data) < 126 else bytes([0xFE, 0, len(data)]))
+    raw.sendall(head + bytes(4) + data)  # masked with zeros
+    return raw
+
+
+def test_a_page_that_comes_back_is_heard_though_the_old_one_is_dead(
+    fresh: HeadsetPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(raw_page(fresh.endpoint, code=code(fresh), name="ann")) as old:
+        said = b""
+        while b'"session":"' not in said:
+            said += old.recv(4096)
+        session = said.partition(b'"session":"')[2].partition(b'"')[0].decode()
+        with PageClient(fresh.endpoint) as again:
+            assert again.hello(session=session)["type"] == "welcome"
+            began = time.monotonic()
+            again.send(type="ping", n=1, sent_ms=0)
+            again.wait("pong")
+            assert time.monotonic() - began < 0.9  # it took the second that the old one has to close
+
+
+def test_who_is_taken_off_the_list_has_to_go_and_may_come_back(
+    site: Path, edge: RoomServer, tmp_path: Path
+) -> None:
+    keys = tmp_path / "keys"
+    public = [generate_pair(keys / name, name).public for name in ("edge", "ann", "bob")]
+    folder = keys / "edge"
+
+    def give(objects: bool) -> None:
+        authorize(folder, "ann", public[1], permissions={Permission.OBJECTS: objects})
+
+    give(objects=True)
+    authorize(folder, "bob", public[2])
+    access = EdgeAccess(edge.address, ALL, folder, public[0], bytes(32))
+    told: list[str] = []
+    with closing(serve(site, edge.address, access=access, notify=told.append)) as page:
+        assert code(page) == page.shown_report(is_guarded=True)["code"]
+        assert code(page) not in str(page.shown_report(is_guarded=False))
+        with PageClient(page.endpoint) as ann:
+            welcome = ann.hello(code=code(page), name="ann")
+            assert welcome["may"] == {"objects": True, "commands": False}
+            ann.keep_alive()
+            revoke(folder, "ann")
+            ann.put(5, 1, 1.0)
+            assert "no agent 'ann'" in ann.wait("receipt", lambda m: m["request"] == 5)["reason"]
+            refused = ann.wait("refused")
+            assert "share keys authorize ann ann.public" in refused["reason"] and not refused["is_over"]
+            assert ann.is_closed()
+        assert soon(lambda: any("'ann' has to go" in line for line in told))
+        give(objects=False)
+        with PageClient(page.endpoint) as ann:
+            assert ann.hello(session=welcome["session"])["may"]["objects"] is False
+            ann.keep_alive()
+            give(objects=True)
+            assert ann.is_closed()  # it comes back by itself, and is told
+        with PageClient(page.endpoint) as ann:
+            assert ann.hello(session=welcome["session"])["may"]["objects"] is True
+            ann.keep_alive()
+            (folder / "authorized").write_bytes(b"\0garbage")
+            time.sleep(1.5)
+            with PageClient(page.endpoint) as other:
+                said = other.hello(session=welcome["session"])
+                assert "the edge's list of keys cannot be used" in said["reason"] and not said["is_over"]
+            ann.send(type="ping", n=1, sent_ms=0)
+            ann.wait("pong", lambda m: m["n"] == 1)  # who is here stays
+            (folder / "authorized").unlink()
+            assert "no agent 'ann'" in ann.wait("refused")["reason"]  # though it asks for nothing
 
 
 def test_what_is_malformed_or_too_large_ends_only_its_sender(fresh: HeadsetPage) -> None:
@@ -403,6 +511,22 @@ def test_a_server_that_is_killed_comes_back_and_knows_its_wearers(
             assert soon(lambda: len(table.read_text().splitlines()) == 3)  # nothing of before is lost
     assert told[0].startswith("headset page: the code for the next wearer is ")
     assert "headset page: 'ann' has paired, with the device of 'ann'" in told
+
+
+def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomServer) -> None:
+    with closing(serve(site, edge.address)) as page:
+        with paired(page, "ann") as first:
+            old = first.seen[0]["session"]
+        assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": False})["is_connected"])
+        with paired(page, "ann") as second:
+            new = second.seen[0]["session"]
+    with closing(serve(site, edge.address)) as page:
+        code(page)
+        for session, answer in ((old, "refused"), (new, "welcome"), (old, "refused")):
+            with PageClient(page.endpoint) as one:
+                said = one.hello(session=session)
+                assert said["type"] == answer
+                assert answer == "welcome" or (said["is_over"] and "another headset" in said["reason"])
 
 
 def test_an_edge_that_goes_and_comes_is_told_and_all_heals(site: Path) -> None:

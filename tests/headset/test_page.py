@@ -15,7 +15,7 @@ pytestmark = pytest.mark.long
 
 def test_pairing_says_what_is_wrong_and_a_name_is_a_text(chromium: Browser, room: HeadsetRoom) -> None:
     page = chromium.page(room.url)
-    worn.pair(page, "ann", code="000000")
+    worn.pair(page, "ann", code="00000000")
     page.wait("document.getElementById('reason').textContent.includes('code is wrong')")
     assert not page.app("app.room.agents.size + app.room.objects.size")  # nothing before pairing
     room.put(1, "cube", "<img src=x onerror=alert(1)>", np.eye(4))
@@ -99,6 +99,12 @@ def test_a_lost_server_comes_back_and_nothing_is_lost(chromium: Browser, room: H
     assert len({one["command"] for one in room.of_type("cancel")}) == 1  # the first may have arrived
     page.open(room.url)  # loaded again: goes on with its session
     page.wait("app.connection.isConnected && app.wearer === 'ann' && app.room.objects.has(77)")
+    room.hindrance = "the edge's list of keys cannot be used"
+    room.drop()
+    page.wait("app.connection.text.includes('list of keys')")
+    assert page.app("app.connection.isPaired && document.getElementById('start').hidden")
+    room.hindrance = ""
+    page.wait("app.connection.isConnected && app.wearer === 'ann'", 20)  # by the session that it kept
     room._names.clear()  # the server knows it no longer
     room.drop()
     page.wait("!app.connection.isPaired && !document.getElementById('start').hidden")

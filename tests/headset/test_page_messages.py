@@ -19,7 +19,7 @@ PUT = {"type": "put", "request": 7, "id": 3, "kind": "cube", "map_id": "ann-1/0"
 PUT |= {"position": [1, 2.5, 0], "quaternion": [0, 0, math.sqrt(0.5), math.sqrt(0.5)]}
 GOTO = {"type": "goto", "command": 9, "robot": None, "map_id": None, "x": 1, "y": 2, "yaw": None}
 VALID: list[dict[str, Any]] = [
-    {"type": "hello", "schema": 1, "code": "483921", "name": "ann", "agent": None},
+    {"type": "hello", "schema": 1, "code": "48392175", "name": "ann", "agent": None},
     {"type": "hello", "schema": 1, "session": "x"},
     {"type": "ping", "n": 1, "sent_ms": 12.5},
     PUT,

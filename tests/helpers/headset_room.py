@@ -23,7 +23,7 @@ from share.geometry import se3
 from share.types import F64
 
 PAGE = Path(__file__).resolve().parents[2] / "share" / "headset" / "page"
-CODE = "483921"
+CODE = "48392175"
 MAP = "ann-1/0"
 _OWN = "script-src 'self'; style-src 'self'; connect-src 'self'"
 _POLICY = f"default-src 'none'; {_OWN}; base-uri 'none'; form-action 'none'"
@@ -37,6 +37,7 @@ class HeadsetRoom:
         self.agents, self.objects = agents, dict[int, dict[str, Any]]()
         self.received = list[dict[str, Any]]()  # of pages; with the moment, ns
         self.map_id, self.delay_s, self.refusal = MAP, 0.012, ""
+        self.hindrance = ""  # why nobody is let in for now
         self.mount: F64 | None = None
         self.may = {"objects": True, "commands": True}
         self.paths: dict[str, list[list[float]]] = {}
@@ -108,6 +109,10 @@ class HeadsetRoom:
 
     def _serve(self, connection: ServerConnection) -> None:
         hello = json.loads(connection.recv())
+        if self.hindrance:
+            refused = {"type": "refused", "reason": self.hindrance, "is_over": False}
+            connection.send(json.dumps(refused))
+            return
         if "session" in hello and hello["session"] in self._names:
             session = hello["session"]
         elif hello.get("code") == CODE:
@@ -119,7 +124,7 @@ class HeadsetRoom:
                 if "code" in hello
                 else "this session has ended: pair again"
             )
-            connection.send(json.dumps({"type": "refused", "reason": reason}))
+            connection.send(json.dumps({"type": "refused", "reason": reason, "is_over": True}))
             return
         name, agent = self._names[session]
         mount = None if self.mount is None else self.mount.ravel().tolist()

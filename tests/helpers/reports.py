@@ -29,4 +29,4 @@ def headset_report() -> dict[str, Any]:
     measured = PageMeasured("align", 144, 3, 12.5, 18.0, 22.0, 4.0, 0.5)
     about = {"agent": "ann", "is_connected": True, "is_connected_to_edge": True}
     wearers = {"ann": about | measured_fields(measured)}
-    return msgspec.structs.asdict(ServerReport("", "483921", 2, 1, wearers))
+    return msgspec.structs.asdict(ServerReport("", "48392175", 2, 1, wearers))

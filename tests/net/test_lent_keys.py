@@ -60,7 +60,8 @@ def test_each_name_has_the_rights_that_the_list_gives_it(folder: Path) -> None:
     with RoomServer(keys=keys) as edge:
 
         def link(name: str, key: str) -> RoomLink:
-            return RoomLink(edge.address, name, AgentKeys(lent.pair(key), keys.own.public))
+            pair = lent.pair(key)
+            return RoomLink(edge.address, name, AgentKeys(pair, keys.own.public, is_lent=True))
 
         with closing(link("ann", "ann")) as ann, closing(link("bob", "bob")) as bob:
             assert put(ann) == ""
@@ -73,6 +74,7 @@ def test_each_name_has_the_rights_that_the_list_gives_it(folder: Path) -> None:
                 wait_for(other, lambda: False, 20.0)
             revoke(folder, "ann-pc")
             assert wait_for(ann, lambda: not ann.client.is_connected)
+            assert wait_for(ann, lambda: "has no agent 'ann' any more" in (ann.trouble or ""))
             assert wait_for(bob, lambda: bob.client.is_connected)
 
 
@@ -84,6 +86,12 @@ def test_a_list_without_a_loan_has_none(folder: Path) -> None:
     assert lending.agents_for(public) == {"ann"}
     assert lending.permissions_of(public) == {Permission.OBJECTS}
     assert not lending.is_allowed(LentKeys(b"t" * 32).pair("ann").public)
+    other = "x" * 40
+    assert f"share keys authorize NAME '{other}'" in lending.refusal(other, "127.0.0.1")
+    for name in ("ann-pc", "bob-pc"):
+        revoke(folder, name)
+    said = lending.refusal(public, "127.0.0.1")  # a key that nobody has in a file: not to be authorized
+    assert said == "a client of 'ann' (127.0.0.1): the list has no agent of that name any more"
     assert public not in lending.names_by_key()  # it is in no list that a person sees
 
 
@@ -94,9 +102,9 @@ def test_a_name_has_what_any_of_its_keys_may(folder: Path, tmp_path: Path) -> No
     assert allow_list(folder).rights() == {"ann": both, "bob": none, "cy": frozenset({Permission.COMMANDS})}
     access = EdgeAccess("tcp://127.0.0.1:1", both, folder, "", SECRET)
     assert access.rights_of("bob") == none
-    with pytest.raises(PairingError, match="has no agent 'zoe'; on it run: share keys authorize zoe"):
+    with pytest.raises(PairingError, match=r"has no agent 'zoe'; .*: share keys authorize zoe zoe\.public"):
         access.rights_of("zoe")
     (folder / "authorized").write_text("nonsense\n")
-    with pytest.raises(PairingError, match=r"the edge's list of keys: .*line 1"):
+    with pytest.raises(PairingError, match=r"the edge's list of keys cannot be used: .*line 1"):
         access.rights_of("ann")
     assert EdgeAccess("tcp://127.0.0.1:1", both).rights_of("zoe") == both

@@ -130,6 +130,17 @@ def test_idle_connections_make_no_thread_and_keep_nobody_out(served):
         assert len(served.peer_connections._waiting) <= 32
 
 
+def test_one_that_waits_ends_for_another_of_the_address_with_the_most(served):
+    with contextlib.ExitStack() as stack:
+        honest = stack.enter_context(from_address(served, "127.0.0.2"))
+        for _ in range(100):
+            stack.enter_context(from_address(served, "127.0.0.1"))
+        time.sleep(0.2)
+        honest.settimeout(0.2)
+        with pytest.raises(TimeoutError):  # it is open
+            honest.recv(1)
+
+
 def test_too_many_readers_are_refused_before_they_are_served(served):
     with contextlib.ExitStack() as stack:
         for _ in range(MAX_READERS):

@@ -146,6 +146,10 @@ export class Connection {
                 this.#onWelcome(message);
                 break;
             case "refused":
+                if (this.isPaired && !message.is_over) {
+                    this.#tryLater(message.reason);
+                    return;
+                }
                 this.#onRefused(message);
                 break;
             case "receipt":
@@ -171,6 +175,13 @@ export class Connection {
         this.clock.forget();
         for (let k = 0; k < FIRST_PINGS; k++) this.#timers.push(setTimeout(() => this.#ping(), 60 * k));
         for (const message of this.#pending.values()) this.#send(message);
+    }
+
+    // The session stays: what hinders it may pass.
+    #tryLater(reason) {
+        this.#leave();
+        this.text = reason;
+        this.#timers.push(setTimeout(() => this.#connect(), LONGEST_WAIT_MS));
     }
 
     // Nothing more is tried: the secret holds no longer, or another page has it.
