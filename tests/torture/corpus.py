@@ -134,7 +134,7 @@ def _made_up(version: int) -> dict[str, Message]:
         "object": [pack([version, 49, [1, 2, 3, "cube", "ann", "ann-1234/0", ""], pose]), eye],
         "objects": [pack([version, 50, [1, 2, [3], [2]], []])],
         "refused": [pack([version, 17, ["no"], []])],
-        "rate": [pack([version, 20, [3.0, True, None], []])],
+        "rate": [pack([version, 20, [3.0, True, None, 20], []])],
         "tracked": [pack([version, 22, [0, 10, "OK", False, False, True, None], pose]), eye],
         "correction": [
             pack([version, 19, ["ann-1234/0", 1, 0, 0], [*pose, ["<f8", [6, 6]]]]),

@@ -180,7 +180,8 @@ def rates(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
     out = edge.honest(kind, scalars)
     numbers = (0.0, 5e-324, 1e-300, 1000.0, -1.0, math.inf, math.nan)
     pose_hz = edge.draw.choice((None, *numbers))
-    return [*out, edge.of("rate", edge.draw.choice(numbers), edge.draw.random() < 0.5, pose_hz)]
+    quality = edge.draw.choice((None, 1, 20, 100, 0, -1, 10**9, 2.5))
+    return [*out, edge.of("rate", edge.draw.choice(numbers), edge.draw.random() < 0.5, pose_hz, quality)]
 
 
 def refuses(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
