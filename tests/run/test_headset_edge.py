@@ -53,7 +53,7 @@ def test_an_edge_is_killed_and_its_wearer_goes_on(tmp_path: Path, settings: Path
         map_id = _map_of(store)
     at_map = ("--map", str(tmp_path / "room.sqlite"))
     edge, page, status = start(tmp_path, "first", "http://127.0.0.1:0", *at_map)
-    code = edge.wait_for(r"the code for the next wearer is (\d{6})", WAIT_S)[1]
+    code = edge.wait_for(r"the code for the next wearer is (\d{8})", WAIT_S)[1]
     shown = json.loads(fetched(f"{status}snapshot.json"))["headset"]
     assert (shown["code"], shown["address"], shown["wearers"]) == (code, f"{page}/", {})
     with PageClient(page) as ann:
@@ -166,7 +166,7 @@ def test_a_page_is_encrypted_by_a_certificate_whose_fingerprint_is_said(tmp_path
     host, port = page.removeprefix("https://").split(":")
     found = ssl.PEM_cert_to_DER_cert(ssl.get_server_certificate((host, int(port)), timeout=WAIT_S))
     assert said.replace(":", "").lower() == hashlib.sha256(found).hexdigest()
-    code = edge.wait_for(r"the code for the next wearer is (\d{6})", WAIT_S)[1]
+    code = edge.wait_for(r"the code for the next wearer is (\d{8})", WAIT_S)[1]
     trusting = ssl.create_default_context(cadata=ssl.DER_cert_to_PEM_cert(found))
     with PageClient(page, ssl=trusting) as ann:
         assert ann.hello(code=code, name="ann")["type"] == "welcome"
