@@ -93,5 +93,5 @@ def draw_goals(path: Path, rows: Sequence[Row]) -> None:
     axes[1].set(xlabel="time, s")
     for axis in axes:
         axis.grid(alpha=0.3)
-    axes[1].legend(frameon=False, loc="lower right")
+    axes[0].legend(frameon=False, loc="center right", bbox_to_anchor=(1.0, 0.65))
     save_png(figure, path, 100)
