@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,12 +36,31 @@ def lock_handle(handle: int) -> None:
         raise
 
 
+_TRY_S = 0.01  # between two attempts
+
+
 @contextlib.contextmanager
-def folder_locked(folder: Path) -> Iterator[None]:
-    """Let one process at a time into the block, of all that lock `folder`; the others wait."""
+def folder_locked(folder: Path, wait_s: float | None = None) -> Iterator[None]:
+    """Let one process at a time into the block, of all that lock `folder`; the others wait. wait_s: for so
+    long, then BlockingIOError."""
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        if wait_s is None:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        else:
+            _lock_soon(handle, time.monotonic() + wait_s)
         yield
     finally:
         os.close(handle)
+
+
+def _lock_soon(handle: int, until_s: float) -> None:
+    """Lock an open folder until a moment. Raises BlockingIOError."""
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() >= until_s:
+                raise
+            time.sleep(_TRY_S)

@@ -87,7 +87,11 @@ class HeadsetServer:
         self._listener = BoundedListener(listener, self._connections)
         self._room = SharedRoom()
         self._wearers = WearerRegistry(
-            settings.access, settings.session_key, SessionLedger(settings.sessions), self._notify
+            settings.access,
+            settings.session_key,
+            SessionLedger(settings.sessions),
+            self._notify,
+            self._dismiss,
         )
         self._table = MeasureTable(settings.table)
         self._path_due_s, self._code_shown = 0.0, ""

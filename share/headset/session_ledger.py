@@ -18,6 +18,7 @@ from share.headset.pairing import SESSION_S, WearerSession
 
 LEDGER_FILE = "headset.sessions"
 _MAX_KNOWN = 1024  # names
+_LOCK_S = 0.2  # all pages of the server wait meanwhile
 _decoder = msgspec.json.Decoder(dict[str, WearerSession])
 
 
@@ -42,15 +43,15 @@ class SessionLedger:
         return end_s if newest is None or newest.end_s < end_s else newest.end_s + 1e-3
 
     def note(self, session: WearerSession, now_s: float) -> None:
-        """Make a session the newest of its name, on disk too. Raises ShareError if that fails; it is noted
-        all the same."""
+        """Make a session the newest of its name, on disk too. Raises ShareError or OSError if that fails; it
+        is noted all the same."""
         known = self._newest.get(session.name)
         if known is not None and known.nonce == session.nonce:
             return
         self._newest[session.name] = session
         if self._folder is None:
             return
-        with folder_locked(self._folder):
+        with folder_locked(self._folder, _LOCK_S):
             for name, other in self._read().items():  # of another edge
                 if other.end_s > self._newest.get(name, other).end_s or name not in self._newest:
                     self._newest[name] = other

@@ -228,15 +228,20 @@ def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *argum
 
 class WearerRegistry:
     """Lets wearers in. key: that sessions are signed with. ledger: of the newest ones. notify: is called with
-    a line for the operator."""
+    a line for the operator. dismiss: with a wearer and its page, where another session takes its place."""
 
     def __init__(
-        self, access: EdgeAccess, key: bytes, ledger: SessionLedger, notify: Callable[[str], None]
+        self,
+        access: EdgeAccess,
+        key: bytes,
+        ledger: SessionLedger,
+        notify: Callable[[str], None],
+        dismiss: Callable[[Wearer, PageSeat, PairingError], None],
     ) -> None:
         self.desk = PairingDesk(secrets.randbelow)
         self._access, self._key = access, key
         self._wearers: dict[str, Wearer] = {}
-        self._ledger, self._notify = ledger, notify
+        self._ledger, self._notify, self._dismiss = ledger, notify, dismiss
 
     def __iter__(self) -> Any:
         return iter(list(self._wearers.values()))
@@ -252,6 +257,9 @@ class WearerRegistry:
             session, rights = self._pair(hello, address)
         wearer = self._wearers.get(session.name)
         if wearer is not None and wearer.session.nonce != session.nonce:
+            if (seat := wearer.seat) is not None:  # else its STOP would reach nobody, without a word
+                reason = f"another headset has paired as '{session.name}' since; pair again"
+                self._dismiss(wearer, seat, SessionOverError(reason))
             self.remove(wearer)
             wearer = None
         if wearer is None:

@@ -20,8 +20,10 @@ import pytest
 from helpers.room_server import MAP, RoomServer
 
 from share.errors import ShareError, TransportError, UsageError
+from share.headset.certificate import default_folder
 from share.headset.headset_page import HeadsetPage, local_address, page_address
 from share.headset.page_messages import PageMeasured
+from share.headset.session_ledger import LEDGER_FILE
 from share.headset.wearers import EdgeAccess
 from share.mapping.loops import KeyframeKey
 from share.net.keys import authorize, generate_pair, revoke
@@ -527,6 +529,24 @@ def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomSer
                 said = one.hello(session=session)
                 assert said["type"] == answer
                 assert answer == "welcome" or (said["is_over"] and "another headset" in said["reason"])
+
+
+def test_a_page_whose_place_a_newer_session_takes_is_told(site: Path, edge: RoomServer) -> None:
+    """What the server knew of sessions is lost, so the older page was let in; its STOP reached nobody."""
+    with closing(serve(site, edge.address)) as page:
+        with paired(page, "ann") as first:
+            old = first.seen[0]["session"]
+        assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": False})["is_connected"])
+        with paired(page, "ann") as second:
+            new = second.seen[0]["session"]
+    for file in default_folder().glob(LEDGER_FILE):
+        file.unlink()
+    with closing(serve(site, edge.address)) as page, PageClient(page.endpoint) as older:
+        assert older.hello(session=old)["type"] == "welcome"
+        with PageClient(page.endpoint) as newer:
+            assert newer.hello(session=new)["type"] == "welcome"
+            said = older.wait("refused")
+            assert said["is_over"] and "another headset has paired as 'ann' since" in said["reason"]
 
 
 def test_an_edge_that_goes_and_comes_is_told_and_all_heals(site: Path) -> None:

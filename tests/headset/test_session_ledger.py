@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
 from share.errors import ShareError, UsageError
+from share.files.locks import folder_locked
 from share.headset.pairing import SESSION_S, WearerSession
 from share.headset.session_ledger import LEDGER_FILE, SessionLedger
 
@@ -49,3 +51,13 @@ def test_what_cannot_be_written_is_said_and_noted(tmp_path: Path) -> None:
     with pytest.raises(ShareError):
         ledger.note(WearerSession("ann", None, 1000.0, "a"), 0.0)
     assert not ledger.is_newest(WearerSession("ann", None, 999.0, "x"))
+
+
+def test_a_lock_that_another_holds_holds_nobody_up(tmp_path: Path) -> None:
+    ledger = SessionLedger(tmp_path)
+    with folder_locked(tmp_path):
+        began_s = time.monotonic()
+        with pytest.raises(BlockingIOError):
+            ledger.note(WearerSession("ann", None, time.time() + 60, "n"), time.time())
+        assert time.monotonic() - began_s < 5
+    assert ledger.is_newest(WearerSession("ann", None, 0.0, "n"))  # it is noted all the same

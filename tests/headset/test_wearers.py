@@ -21,7 +21,7 @@ def wearer(name: str, left_s: float) -> Any:
 
 
 def registry(access: EdgeAccess) -> WearerRegistry:
-    return WearerRegistry(access, bytes(32), SessionLedger(), lambda line: None)
+    return WearerRegistry(access, bytes(32), SessionLedger(), lambda line: None, lambda *_: None)
 
 
 def test_twelve_hours_end_also_for_a_page_that_stays() -> None:
