@@ -27,7 +27,7 @@ from share.timing import TokenBucket
 
 BACKLOG = 16  # that many are accepted at once
 HANDSHAKE_S = 5.0  # from the connection, or the end of TLS's handshake, to the request's end
-TLS_S = 2.0  # for TLS's handshake, and for its end
+TLS_S = 5.0  # for TLS's handshake, and for its end
 _COLLECTED = 64  # connections: asyncio leaves the 256 kB of each unfinished TLS to the garbage collector
 SURE_S = 60.0  # that a place is its holder's, except that an address with more gives it to one with fewer
 PING_S = 10.0  # between PINGs, and until their answer: who gives none is disconnected
