@@ -132,7 +132,8 @@ class StudyPlan:
 
 @dataclass(frozen=True)
 class StudyKey:
-    """policies: by letter. salt: random, so that no digest tells them. seed: of the whole plan."""
+    """policies: by letter, drawn with the salt: random, so that no digest tells them. seed: of spots and
+    orders."""
 
     policies: dict[str, str]
     salt: str
@@ -170,13 +171,18 @@ class PlanWishes:
 
 
 def draw_plan(wishes: PlanWishes, seed: int, salt: str) -> tuple[StudyPlan, StudyKey]:
-    """Draw letters, orders of conditions, and an order of the spots for each trial. Raises UsageError."""
+    """Draw letters by the salt; by the seed, orders of conditions and of the spots for each trial.
+
+    A small seed is found again from the spots of the plan; the letters must not follow from it. Raises
+    UsageError.
+    """
     rng = np.random.default_rng([seed, 2])  # spots are drawn with [seed, 1]
+    secret = np.random.default_rng(int.from_bytes(hashlib.sha256(salt.encode()).digest()))
     count = len(wishes.policies)
     if len(set(wishes.policies)) < count:
         raise UsageError("--policy: one is given twice; each condition has a policy of its own")
     letters = tuple(_LETTERS[:count])
-    shuffled = [wishes.policies[k] for k in rng.permutation(count)]
+    shuffled = [wishes.policies[k] for k in secret.permutation(count)]
     key = StudyKey(dict(zip(letters, shuffled, strict=True)), salt, str(seed))
     try:
         orders = draw_orders(count, wishes.participants, rng)
