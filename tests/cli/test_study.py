@@ -128,6 +128,27 @@ def test_an_edited_record_of_the_unblinding_is_noticed(study):
     assert done.code == 2 and "was edited, or is of another plan" in done.err
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"early": true', '"early": false'),
+        ('"done": 12', '"done": 16'),
+        ('"planned": 16', '"planned": 12'),
+        ('"when": "2', '"when": "1'),
+        ('"hmac_sha256": "', '"hmac_sha256": "0'),
+    ],
+)
+def test_an_edited_note_of_early_unblinding_is_noticed(study, old, new):
+    carry_out(planned(study), participants=3)
+    assert study("unblind", "s", "--key", "s-key.json", "--early").code == 0
+    record = Path("s/unblinded.json")
+    text = record.read_text()
+    assert old in text
+    record.write_text(text.replace(old, new))
+    done = study("analyze", "s")
+    assert done.code == 2 and "was edited, or is of another plan" in done.err and done.err.count("\n") == 1
+
+
 def test_a_swapped_key_is_noticed(study):
     policies = planned(study)
     carry_out(policies)

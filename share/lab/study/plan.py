@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import hmac
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -290,10 +291,21 @@ class Unblinding:
     planned: int
     early: bool
 
+    @property
+    def digest(self) -> str:
+        """HMAC-SHA256 of all but the key, keyed by its salt.
+
+        The salt stands in the same file, so this tells an edit by hand, not a forger who computes it anew.
+        """
+        text = json.dumps([self.when, self.done, self.planned, self.early])
+        return hmac.new(self.key.salt.encode(), text.encode(), hashlib.sha256).hexdigest()
+
 
 def unblinding_text(unblinding: Unblinding) -> str:
     """Return the content of its file."""
-    return json.dumps({"schema": _UNBLINDED_SCHEMA, **dataclasses.asdict(unblinding)}, indent=1) + "\n"
+    fields = dataclasses.asdict(unblinding)
+    content = {"schema": _UNBLINDED_SCHEMA, **fields, "hmac_sha256": unblinding.digest}
+    return json.dumps(content, indent=1) + "\n"
 
 
 def read_unblinding(study: Path, plan: StudyPlan) -> Unblinding | None:
@@ -302,8 +314,9 @@ def read_unblinding(study: Path, plan: StudyPlan) -> Unblinding | None:
     if not path.exists():
         return None
     data = _without_schema(read_json(path), _UNBLINDED_SCHEMA, path)
+    digest = data.pop("hmac_sha256", "")
     unblinding = from_mapping(Unblinding, data, str(path))
-    if unblinding.key.digest != plan.key_sha256:
+    if unblinding.key.digest != plan.key_sha256 or unblinding.digest != digest:
         raise ConfigError(
             f"{path}: was edited, or is of another plan; remove it, and run `share study unblind` again"
         )
