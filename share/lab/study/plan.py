@@ -48,6 +48,8 @@ class StudyQuestion:
     def __post_init__(self) -> None:
         if not self.least < self.greatest:
             raise ValueError(f"question {self.name}: least {self.least} is not below {self.greatest}")
+        if not self.name.isprintable() or not self.name.strip():
+            raise ValueError(f"question {self.name!r:.40}: its name is empty or not printable")
 
 
 # Of the paper's two scales; the words are ours, as the paper's sheet is not public.

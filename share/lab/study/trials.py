@@ -150,7 +150,10 @@ def _read_stands(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan)
 
 
 def _read_status(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
-    record.goals[event["goal"]].status = str(event["status"])
+    status = event["status"]
+    if not (isinstance(status, str) and status.isprintable() and 0 < len(status) <= 100):
+        raise ValueError("status is not printable text of 1 to 100 characters")
+    record.goals[event["goal"]].status = status
 
 
 def _read_end(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:

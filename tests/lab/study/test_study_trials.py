@@ -20,6 +20,7 @@ from share.lab.study.trials import REACHED, REACHED_LONGER, read_trials, trial_f
 RULE = SuccessRule()
 PLAN, KEY = small_plan()
 P01 = PLAN.participants[0].name
+STATUS = {"event": "status", "t_s": 14.0, "goal": 1}
 
 
 def write_trial(study: Path, *lines: dict[str, Any]) -> Path:
@@ -109,6 +110,13 @@ def test_a_power_cut_costs_one_line(tmp_path: Path) -> None:
         ),
         ([begin(PLAN, P01, 1), *goal_events(3, 1, None, 1.0)], "goal 3 at spot 1; the plan has 2"),
         ([begin(PLAN, P01, 1), *goal_events(1, 1, -5.0, 9.0)], "is before the call"),
+        *(
+            (
+                [begin(PLAN, P01, 1), *goal_events(1, 1, None, 9.0), STATUS | {"status": status}],
+                "status is not printable text",
+            )
+            for status in ("ok\n\n# x", "", "\x1b[2J", 3, "x" * 101)
+        ),
         (
             [begin(PLAN, P01, 1), *goal_events(1, 1, 5.0, 9.0), {"event": "end"}],
             "complete, with 1 of 2 goals",
