@@ -102,7 +102,9 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
 )
 @click.option("--distance", type=_Amount(0.01, 100), default=0.5, help="Of success, m.")
 @click.option("--timeout", type=_Amount(0.1, 3600), default=30.0, help="Of success, s.")
-@click.option("--seed", type=click.IntRange(0, 2**63), help="Of the whole plan.  [default: drawn]")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63), help="Of spots and orders, not letters.  [default: drawn]"
+)
 @click.option(
     "--key", "key_file", metavar="FILE", type=options.PATH, help="The key.  [default: DIR-key.json]"
 )
@@ -128,8 +130,8 @@ def plan(
     """Draw who meets which condition when, by letters, and write the key to the letters to a file apart.
 
     Orders are balanced for place and carry-over; each trial has an order of its spots of its own. DIR gets
-    plan.json. Whoever is to stay blind must not see the key, nor --seed, which tells it; nothing is ever
-    overwritten.
+    plan.json. Whoever is to stay blind must not see the key. --seed draws the same spots and orders again,
+    never the same letters: these are drawn by a secret of the key. Nothing is ever overwritten.
 
     \b
     Example:  share study plan --participants 20 --out study

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 import re
 import stat
@@ -128,6 +129,27 @@ def test_an_edited_record_of_the_unblinding_is_noticed(study):
     assert done.code == 2 and "was edited, or is of another plan" in done.err
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"early": true', '"early": false'),
+        ('"done": 12', '"done": 16'),
+        ('"planned": 16', '"planned": 12'),
+        ('"when": "2', '"when": "1'),
+        ('"hmac_sha256": "', '"hmac_sha256": "0'),
+    ],
+)
+def test_an_edited_note_of_early_unblinding_is_noticed(study, old, new):
+    carry_out(planned(study), participants=3)
+    assert study("unblind", "s", "--key", "s-key.json", "--early").code == 0
+    record = Path("s/unblinded.json")
+    text = record.read_text()
+    assert old in text
+    record.write_text(text.replace(old, new))
+    done = study("analyze", "s")
+    assert done.code == 2 and "was edited, or is of another plan" in done.err and done.err.count("\n") == 1
+
+
 def test_a_swapped_key_is_noticed(study):
     policies = planned(study)
     carry_out(policies)
@@ -233,6 +255,48 @@ def test_a_program_without_scipy_stats_and_pandas_computes_all(study, ratings, m
     for name in ("scipy.stats", "pandas"):
         monkeypatch.setitem(sys.modules, name, None)
     assert study("analyze", ratings, "--out", "report").code == 0
+
+
+NAMES = ["[click](javascript:alert(1))", "![x](http://evil.test/p.png)", "<img src=http://evil.test>", "# x"]
+NAMES += [
+    "=1+2",
+    "-a",
+    "[s] time",
+    "a*b*_c_`d`",
+    "1. one",
+    r"\<b> \[x](y)",
+    "> quote",
+    "- item",
+    "x <https://evil.test>",
+]
+
+
+def test_names_of_a_file_stay_text_in_every_report(study, ratings):
+    """Measures and conditions: no link, picture or title of HTML, no formula of CSV, no option of LaTeX."""
+    lines = [line.split(",") for line in ratings.read_text().splitlines()]
+    conditions = {"A": "[c](http://evil.test)", "B": "@sum(A1)", "C": r"*$\frac{$*"}
+    rows = [[who, conditions[one], place, *[value] * len(NAMES)] for who, one, place, value, _ in lines[1:]]
+    rows[0][3:] = [""] * len(NAMES)  # so that names of measures begin lines of the report
+    with ratings.open("w", newline="") as file:
+        csv.writer(file).writerows([["participant", "condition", "place", *NAMES], *rows])
+    Path("best.csv").write_text("participant,most,least\np0,@sum(A1),\n")
+    assert study("analyze", ratings, "--preferences", "best.csv", "--out", "report").code == 0
+    page = Path("report/report.html").read_text()
+    assert "<a " not in page and "<em>" not in page and "<code>" not in page and page.count("<h1>") == 1
+    assert page.count("<img ") == page.count('src="data:image/png') == 2
+    assert "<ol>" not in page and "<blockquote>" not in page and page.count("<ul>") == 2
+    for name in [*NAMES, *conditions.values()]:
+        assert f"<td>{html.escape(name, quote=False)}</td>" in page
+    for name in NAMES:
+        assert f"<li>{html.escape(name[0].upper() + name[1:], quote=False)}: 5 of 6" in page
+    assert not re.search(r"(?<!\\)(?:\\\\)*<[a-z]", Path("report/report.md").read_text())
+    for path in ("descriptives", "tests", "pairs"):
+        for row in csv.DictReader(Path(f"report/{path}.csv").read_text().splitlines()):
+            names = [row[key] for key in ("measure", "condition", "first", "second") if key in row]
+            assert all(one[0] not in "=+-@" for one in names)
+    assert re.search("'=1\\+2,'@sum", Path("report/descriptives.csv").read_text())
+    latex = Path("report/tables.tex").read_text()
+    assert "{}[s] time" in latex and not re.search(r"\\\\\s*(\\hline\s*)?[\[*]", latex)
 
 
 def test_too_few_participants_have_figures_and_no_tests(study, ratings):

@@ -22,10 +22,15 @@ from share.lab.study.trials import EVENTS, trial_folder
 CUBE = (1.0, 1.0)
 
 
-def small_plan(participants: int = 4, policies: tuple[str, ...] = PAPER_POLICIES, seed: int = 5) -> Any:
+def small_plan(
+    participants: int = 4,
+    policies: tuple[str, ...] = PAPER_POLICIES,
+    seed: int = 5,
+    salt: str = "ab" * 16,
+) -> Any:
     """A plan of two spots and its key."""
     spots = np.array([[1.0, 1.0], [2.0, 2.0]])
-    return draw_plan(PlanWishes(participants, policies, spots, spots, SuccessRule()), seed, "ab" * 16)
+    return draw_plan(PlanWishes(participants, policies, spots, spots, SuccessRule()), seed, salt)
 
 
 def begin(of: StudyPlan, who: str, at: int, **changes: Any) -> dict[str, Any]:

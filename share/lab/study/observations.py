@@ -67,17 +67,19 @@ def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
     measures = {name: np.full(shape, math.nan) for name in TRIAL_MEASURES}
     records = read_trials(study, plan)
     statuses: Counter[str] = Counter()
+    repeated: Counter[int] = Counter()
     for (name, place), record in records.items():
         cell = people.index(name), plan.letters.index(record.condition)
         places[cell] = place
         if record.is_complete:
             statuses.update(goal.status for goal in record.goals.values())
+            repeated.update(record.repeated)
             for measure, value in trial_measures(record.goals.values(), rule).items():
                 measures[measure][cell] = value
     answers, choices = _read_answers(study / ANSWERS, plan)
     judges = sorted({record.judge for record in records.values()})
     done = sum(record.is_complete for record in records.values())
-    notes = (*_broken_note(records), *_judge_notes(judges, statuses))
+    notes = (*_broken_note(records), *_repeated_note(repeated), *_judge_notes(judges, statuses))
     return Observations(
         tuple(people), plan.letters, measures | answers, places, choices, notes, places.size, done
     )
@@ -88,6 +90,14 @@ def _broken_note(records: Mapping[tuple[str, int], Any]) -> Iterable[str]:
     if broken:
         names = ", ".join(broken)
         yield f"{len(broken)} trials were begun and not carried through; their goals are left out: {names}"
+
+
+def _repeated_note(repeated: Mapping[int, int]) -> Iterable[str]:
+    if repeated:
+        yield (
+            f"{sum(repeated.values())} calls were repeated, of which only the last one of a goal counts: "
+            + ", ".join(f"spot {spot} {count}" for spot, count in sorted(repeated.items()))
+        )
 
 
 def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable[str]:

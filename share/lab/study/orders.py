@@ -1,9 +1,12 @@
 """Orders in which participants meet the conditions, balanced for place and first-order carry-over.
 
 A Williams square of an even number of conditions k has k orders, of an odd number two squares have 2 k: each
-condition is as often in each place, and follows each other one as often. All k! orders fall into such blocks,
-no two of which share an order, so consecutive participants are a block and no order comes twice before all
-have come. Of a last block that is not filled, the rows are those that leave the least imbalance.
+condition is as often in each place, and follows each other one as often. Each square is a Latin square, so
+after any multiple of k orders all places are taken alike, but for odd k, after one square of a pair, some
+conditions follow each other twice more than others. Of a last square that is not filled, the rows are those
+that leave the successions most even; places then differ by one at most, successions by one (even k) or two.
+All k! orders fall into such blocks, no two of which share an order, so no order comes twice before all have
+come.
 
 Source: E. J. Williams, Experimental designs balanced for the estimation of residual effects of treatments,
 Australian Journal of Scientific Research A 2, 1949.
@@ -21,51 +24,47 @@ import numpy as np
 from share.types import I64
 
 MIN_CONDITIONS, MAX_CONDITIONS = 2, 8
-_MAX_CHOICES = 500  # of rows of a last block that are compared
 
 
 def draw_orders(conditions: int, participants: int, rng: np.random.Generator) -> I64:
     """Return orders (participants, conditions) of condition numbers from 0. Raises ValueError."""
     if not MIN_CONDITIONS <= conditions <= MAX_CONDITIONS:
         raise ValueError(f"{conditions} conditions; {MIN_CONDITIONS} to {MAX_CONDITIONS} can be balanced")
-    square = _williams(conditions)
-    total = math.factorial(conditions) // len(square)
+    squares = _williams(conditions)
+    total = math.factorial(conditions) // (len(squares) * conditions)
     rows: list[I64] = []
     used: set[tuple[int, ...]] = set()
     while len(rows) < participants:
-        block = rng.permutation(conditions)[square]
-        name = min(map(tuple, block.tolist()))
+        block = rng.permutation(conditions)[squares]
+        name = min(tuple(row) for square in block.tolist() for row in square)
         if name in used:
             continue
         used.add(name)
         if len(used) == total:  # all orders have been used: begin again
             used.clear()
-        rows += _rows_of_block(block, participants - len(rows), rng)
+        for square in rng.permutation(block):
+            rows += _rows_of_square(rng.permutation(square), participants - len(rows), rows)
     return np.array(rows, np.int64)
 
 
 def _williams(k: int) -> I64:
-    """Return a Williams square (k, k), for odd k a pair of them (2 k, k): 0, 1, k-1, 2, … and its shifts."""
+    """Return a Williams square (1, k, k), for odd k a pair of them (2, k, k): 0, 1, k-1, 2, … and its
+    shifts."""
     first = [(n + 1) // 2 if n % 2 else (k - n // 2) % k for n in range(k)]
     square = (np.array(first) + np.arange(k)[:, None]) % k
-    return np.concatenate([square, square[:, ::-1]]) if k % 2 else square
+    return np.array([square, square[:, ::-1]] if k % 2 else [square])
 
 
-def _rows_of_block(block: I64, wanted: int, rng: np.random.Generator) -> list[I64]:
-    """Return the block's rows in random order; if fewer are wanted, those with the least imbalance."""
-    shuffled = rng.permutation(block)
-    if wanted >= len(block):
-        return list(shuffled)
-    choices = list(combinations(range(len(block)), wanted))
-    if len(choices) > _MAX_CHOICES:
-        choices = [tuple(rng.permutation(len(block))[:wanted].tolist()) for _ in range(_MAX_CHOICES)]
-    best = min(choices, key=lambda rows: _imbalance(shuffled[list(rows)]))
-    return list(shuffled[list(best)])
+def _rows_of_square(square: I64, wanted: int, before: list[I64]) -> list[I64]:
+    """Return the square's rows; if fewer are wanted, those with the least imbalance after the ones before."""
+    if wanted >= len(square):
+        return list(square)
+    choices = (square[list(rows)] for rows in combinations(range(len(square)), wanted))
+    return list(min(choices, key=lambda rows: _imbalance(np.array([*before, *rows]))))
 
 
 def _imbalance(orders: I64) -> int:
-    balance = Balance.of(orders)
-    return int((balance.places**2).sum() + (balance.successions**2).sum())
+    return int((Balance.of(orders).successions ** 2).sum())
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import hmac
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -47,6 +48,8 @@ class StudyQuestion:
     def __post_init__(self) -> None:
         if not self.least < self.greatest:
             raise ValueError(f"question {self.name}: least {self.least} is not below {self.greatest}")
+        if not self.name.isprintable() or not self.name.strip():
+            raise ValueError(f"question {self.name!r:.40}: its name is empty or not printable")
 
 
 # Of the paper's two scales; the words are ours, as the paper's sheet is not public.
@@ -132,7 +135,8 @@ class StudyPlan:
 
 @dataclass(frozen=True)
 class StudyKey:
-    """policies: by letter. salt: random, so that no digest tells them. seed: of the whole plan."""
+    """policies: by letter, drawn with the salt: random, so that no digest tells them. seed: of spots and
+    orders."""
 
     policies: dict[str, str]
     salt: str
@@ -170,13 +174,18 @@ class PlanWishes:
 
 
 def draw_plan(wishes: PlanWishes, seed: int, salt: str) -> tuple[StudyPlan, StudyKey]:
-    """Draw letters, orders of conditions, and an order of the spots for each trial. Raises UsageError."""
+    """Draw letters by the salt; by the seed, orders of conditions and of the spots for each trial.
+
+    A small seed is found again from the spots of the plan; the letters must not follow from it. Raises
+    UsageError.
+    """
     rng = np.random.default_rng([seed, 2])  # spots are drawn with [seed, 1]
+    secret = np.random.default_rng(int.from_bytes(hashlib.sha256(salt.encode()).digest()))
     count = len(wishes.policies)
     if len(set(wishes.policies)) < count:
         raise UsageError("--policy: one is given twice; each condition has a policy of its own")
     letters = tuple(_LETTERS[:count])
-    shuffled = [wishes.policies[k] for k in rng.permutation(count)]
+    shuffled = [wishes.policies[k] for k in secret.permutation(count)]
     key = StudyKey(dict(zip(letters, shuffled, strict=True)), salt, str(seed))
     try:
         orders = draw_orders(count, wishes.participants, rng)
@@ -284,10 +293,21 @@ class Unblinding:
     planned: int
     early: bool
 
+    @property
+    def digest(self) -> str:
+        """HMAC-SHA256 of all but the key, keyed by its salt.
+
+        The salt stands in the same file, so this tells an edit by hand, not a forger who computes it anew.
+        """
+        text = json.dumps([self.when, self.done, self.planned, self.early])
+        return hmac.new(self.key.salt.encode(), text.encode(), hashlib.sha256).hexdigest()
+
 
 def unblinding_text(unblinding: Unblinding) -> str:
     """Return the content of its file."""
-    return json.dumps({"schema": _UNBLINDED_SCHEMA, **dataclasses.asdict(unblinding)}, indent=1) + "\n"
+    fields = dataclasses.asdict(unblinding)
+    content = {"schema": _UNBLINDED_SCHEMA, **fields, "hmac_sha256": unblinding.digest}
+    return json.dumps(content, indent=1) + "\n"
 
 
 def read_unblinding(study: Path, plan: StudyPlan) -> Unblinding | None:
@@ -296,8 +316,9 @@ def read_unblinding(study: Path, plan: StudyPlan) -> Unblinding | None:
     if not path.exists():
         return None
     data = _without_schema(read_json(path), _UNBLINDED_SCHEMA, path)
+    digest = data.pop("hmac_sha256", "")
     unblinding = from_mapping(Unblinding, data, str(path))
-    if unblinding.key.digest != plan.key_sha256:
+    if unblinding.key.digest != plan.key_sha256 or unblinding.digest != digest:
         raise ConfigError(
             f"{path}: was edited, or is of another plan; remove it, and run `share study unblind` again"
         )

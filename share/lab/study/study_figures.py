@@ -15,6 +15,11 @@ _COLUMNS = 2  # of panels: a phone shows two
 _JITTER = 0.22  # of dots, of a bar's place
 
 
+def _label(name: str) -> str:
+    """Return a name that matplotlib does not take for a formula."""
+    return name.replace("$", r"\$")
+
+
 def draw_measures(path: Path, study: StudyAnalysis, table: Observations) -> None:
     """Write a PNG with a panel for each measure: bars of means, whiskers of 95 %, a dot for each
     participant."""
@@ -37,8 +42,8 @@ def draw_measures(path: Path, study: StudyAnalysis, table: Observations) -> None
             if np.isfinite(one.mean.low):
                 whiskers = [[one.mean.value - one.mean.low], [one.mean.high - one.mean.value]]
                 axis.errorbar(k, one.mean.value, whiskers, color="black", capsize=4)
-        axis.set_xticks(range(len(study.conditions)), study.conditions)
-        axis.set_title(measure.name, fontsize=9)
+        axis.set_xticks(range(len(study.conditions)), list(map(_label, study.conditions)))
+        axis.set_title(_label(measure.name), fontsize=9)
         axis.grid(axis="y", alpha=0.3)
         axis.set_axisbelow(True)
     for axis in axes.ravel()[len(study.measures) :]:
@@ -49,7 +54,7 @@ def draw_measures(path: Path, study: StudyAnalysis, table: Observations) -> None
 def draw_choices(path: Path, study: StudyAnalysis) -> None:
     """Write a PNG of how often each condition was preferred most and least."""
     series = {
-        condition: [float(one.counts[k]) for one in study.choices.values()]
+        _label(condition): [float(one.counts[k]) for one in study.choices.values()]
         for k, condition in enumerate(study.conditions)
     }
     draw_bars(path, {"": series}, [f"{kind} preferred" for kind in study.choices], "participants")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -71,13 +72,14 @@ def write_report(
     atomic_write(out / "pairs.csv", _pairs_csv(study))
     atomic_write(out / "tables.tex", _latex(study))
     atomic_write(out / "report.md", text)
-    atomic_write(out / "report.html", html_page("Study", text, out))
+    # html_page escapes HTML itself, and its Markdown does not know these two
+    atomic_write(out / "report.html", html_page("Study", re.sub(r"\\([<>])", r"\1", text), out))
     return [out / name for name in FILES]
 
 
 def _sections(study: StudyAnalysis, pictures: Sequence[str], rule: SuccessRule | None) -> list[str]:
     about = [*coverage_lines(study), *([] if rule is None else [rule_line(rule)])]
-    parts = ["# Study", bullets(about), *pictures]
+    parts = ["# Study", bullets(map(_markdown_text, about)), *pictures]
     for title, rows, note in (
         ("Descriptive figures", descriptive_rows(study), ""),
         ("Do the conditions differ?", comparison_rows(study), ""),
@@ -87,12 +89,25 @@ def _sections(study: StudyAnalysis, pictures: Sequence[str], rule: SuccessRule |
         ("The next study", power_rows(study), _POWER_NOTE),
     ):
         if len(rows) > 1:
-            cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+            cells = [[_markdown_text(cell) for cell in row] for row in rows]
             parts += [f"## {title}", *([note] if note else []), markdown_table(cells)]
     return [*parts, "## How it was computed", bullets(METHODS)]
 
 
+_MARKDOWN = re.compile(r"[\\`*_\[\]!|#~]|<(?=[A-Za-z/!?])|^(?:>|[-+](?= ))|(?<=^\d)[.)]|(?<=^\d\d)[.)]")
+
+
+def _markdown_text(text: str) -> str:
+    """Return text that Markdown shows as it is: names of files must not become links or pictures."""
+    return _MARKDOWN.sub(lambda found: f"\\{found[0]}", " ".join(text.split()))
+
+
 # CSV: numbers alone, an empty cell where there is none.
+
+
+def _csv_name(name: str) -> str:
+    """Return a name that no spreadsheet takes for a formula."""
+    return f"'{name}" if name.startswith(("=", "+", "-", "@")) else name
 
 
 def _bounds(name: str) -> tuple[str, str, str]:
@@ -103,7 +118,7 @@ def _descriptives_csv(study: StudyAnalysis) -> str:
     head = [*("measure", "condition", "n"), *_bounds("mean"), *("SD", "min", "q1", "median", "q3", "max")]
     rows = [
         [
-            *(measure.name, one.condition, one.count, *one.mean, one.deviation),
+            *(_csv_name(measure.name), _csv_name(one.condition), one.count, *one.mean, one.deviation),
             *(one.least, one.lower_quartile, one.median, one.upper_quartile, one.greatest),
         ]
         for measure in study.measures
@@ -126,7 +141,7 @@ def _tests_csv(study: StudyAnalysis) -> str:
 
 
 def _test_cells(one: MeasureAnalysis) -> list[object]:
-    cells: list[object] = [one.name, one.complete]
+    cells: list[object] = [_csv_name(one.name), one.complete]
     if one.friedman is not None and one.anova is not None:
         ranks, anova, sphericity = one.friedman, one.anova, one.anova.sphericity
         cells += [ranks.chi2, ranks.df, ranks.p, *ranks.concordance]
@@ -154,7 +169,7 @@ def _pairs_csv(study: StudyAnalysis) -> str:
     ]
     rows = [
         [
-            *(measure.name, one.first, one.second, *one.difference),
+            *(*map(_csv_name, (measure.name, one.first, one.second)), *one.difference),
             *(one.wilcoxon.w, one.wilcoxon.pairs, one.wilcoxon.total_pairs),
             *(one.wilcoxon.p, int(one.wilcoxon.is_exact), one.p_holm, one.p_nemenyi),
             *one.wilcoxon.rank_biserial,
@@ -180,7 +195,8 @@ def _latex(study: StudyAnalysis) -> str:
 def latex_table(rows: Rows, caption: str) -> str:
     """Return a LaTeX table of rows with their head; needs no package."""
     columns = "l" + "r" * (len(rows[0]) - 1)
-    head, *body = (" & ".join(map(_latex_text, row)) + r" \\" for row in rows)
+    # {}: else \\ takes a [ or * of the next row for its own
+    head, *body = ("{}" + " & ".join(map(_latex_text, row)) + r" \\" for row in rows)
     lines = [
         r"\begin{table}",
         rf"\caption{{{_latex_text(caption)}}}",

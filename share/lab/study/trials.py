@@ -7,6 +7,7 @@ where it judges, else of the map. A goal that is called again, after an interrup
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,7 @@ from share.robot.settings import CREATE3_SPEED_M_S
 
 EVENTS = "events.jsonl"
 JUDGES = ("mocap", "map")
+_MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,14 @@ class CalledGoal:
 
 @dataclass
 class TrialRecord:
-    """What happened in a trial. is_complete: it was carried through."""
+    """What happened in a trial. is_complete: it was carried through. repeated: calls at each spot that a
+    later call of the same goal replaced."""
 
     condition: str
     judge: str
     goals: dict[int, CalledGoal]  # by number, from 1
     is_complete: bool
+    repeated: Counter[int] = field(default_factory=Counter)
 
 
 def trial_folder(study: Path, participant: str, place: int) -> Path:
@@ -113,6 +117,10 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
         raise DataError(
             f"{path}: says that it is complete, with {len(record.goals)} of {len(plan.spots)} goals"
         )
+    visits = Counter(goal.spot for goal in record.goals.values())
+    if record.is_complete and len(visits) < len(plan.spots):
+        twice = ", ".join(str(spot) for spot, count in sorted(visits.items()) if count > 1)
+        raise DataError(f"{path}: goals share spot {twice}; the plan visits each spot once")
     return record
 
 
@@ -129,28 +137,34 @@ def _read_call(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -
     cube, robot = (_position(event[name]) for name in ("cube_m", "robot_m"))
     straight_m = math.dist(cube, robot)
     goal = CalledGoal(
-        int(event["spot"]), _number(event["t_s"]), cube, straight_m, _number(event.get("path_m", straight_m))
+        *(_whole(event["spot"]), _number(event["t_s"]), cube, straight_m),
+        _path_m(event.get("path_m", straight_m)),
     )
-    number = int(event["goal"])
+    number = _whole(event["goal"])
     if not (1 <= number <= len(plan.spots) and 1 <= goal.spot <= len(plan.spots)):
         raise ValueError(f"goal {number} at spot {goal.spot}; the plan has {len(plan.spots)} of each")
+    if number in record.goals:
+        record.repeated[record.goals[number].spot] += 1
     record.goals[number] = goal
 
 
 def _read_moves(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
-    goal = record.goals[event["goal"]]
+    goal = record.goals[_whole(event["goal"])]
     if math.isnan(goal.first_motion_s):
         goal.first_motion_s = _since_call(goal, event)
 
 
 def _read_stands(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
-    goal = record.goals[event["goal"]]
+    goal = record.goals[_whole(event["goal"])]
     distance_m = math.dist(goal.cube, _position(event["robot_m"]))
-    goal.stops.append(RobotStop(_since_call(goal, event), distance_m, _number(event["path_m"])))
+    goal.stops.append(RobotStop(_since_call(goal, event), distance_m, _path_m(event["path_m"])))
 
 
 def _read_status(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
-    record.goals[event["goal"]].status = str(event["status"])
+    status = event["status"]
+    if not (isinstance(status, str) and status.isprintable() and 0 < len(status) <= 100):
+        raise ValueError("status is not printable text of 1 to 100 characters")
+    record.goals[_whole(event["goal"])].status = status
 
 
 def _read_end(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
@@ -173,8 +187,22 @@ EVENT_KINDS = ("begin", *_READERS)
 
 
 def _position(value: Sequence[Any]) -> tuple[float, float]:
-    x, y = value
-    return _number(x), _number(y)
+    x, y = map(_number, value)
+    if not max(abs(x), abs(y)) <= _MAX_POSITION_M:
+        raise ValueError(f"{x:g}, {y:g} is beyond {_MAX_POSITION_M:g} m")
+    return x, y
+
+
+def _path_m(value: Any) -> float:
+    if not 0 <= (length_m := _number(value)) <= _MAX_PATH_M:
+        raise ValueError(f"path_m {length_m:g} is not from 0 to {_MAX_PATH_M:g} m")
+    return length_m
+
+
+def _whole(value: Any) -> int:
+    if type(value) is not int:
+        raise TypeError(f"{value!r:.40} is not a whole number")
+    return value
 
 
 def _number(value: Any) -> float:

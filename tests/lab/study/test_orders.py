@@ -41,14 +41,14 @@ def test_an_even_number_of_conditions_is_never_off_by_more_than_one(participants
     assert np.ptp(balance.places) <= 1 and np.ptp(off_diagonal) <= 1
 
 
-@pytest.mark.parametrize("conditions", [3, 5])
-@pytest.mark.parametrize("participants", range(1, 25))
-def test_an_odd_number_of_conditions_is_never_off_by_more_than_two(
+@pytest.mark.parametrize("conditions", [3, 5, 7])
+@pytest.mark.parametrize("participants", range(1, 36))
+def test_odd_conditions_are_off_by_one_in_place_or_two_in_succession_at_most(
     conditions: int, participants: int
 ) -> None:
     balance = Balance.of(draw_orders(conditions, participants, np.random.default_rng(participants)))
     off_diagonal = balance.successions[~np.eye(conditions, dtype=bool)]
-    assert np.ptp(balance.places) <= 2 and np.ptp(off_diagonal) <= 2
+    assert np.ptp(balance.places) <= (participants % conditions > 0) and np.ptp(off_diagonal) <= 2
 
 
 def test_a_plan_that_is_stopped_after_any_block_of_four_is_balanced() -> None:

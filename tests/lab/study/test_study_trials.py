@@ -20,6 +20,8 @@ from share.lab.study.trials import REACHED, REACHED_LONGER, read_trials, trial_f
 RULE = SuccessRule()
 PLAN, KEY = small_plan()
 P01 = PLAN.participants[0].name
+STANDS = goal_events(1, 1, 5.0, 9.0)[2]
+STATUS = {"event": "status", "t_s": 14.0, "goal": 1}
 
 
 def write_trial(study: Path, *lines: dict[str, Any]) -> Path:
@@ -84,6 +86,16 @@ def test_a_goal_that_is_called_again_begins_anew(tmp_path: Path) -> None:
     assert record.is_complete and record.goals[1].reached_s(RULE) == 8.0
 
 
+def test_repeated_calls_are_counted_by_spot(tmp_path: Path) -> None:
+    fill(tmp_path, PLAN, KEY.policies)
+    assert "repeated" not in " ".join(read_study(tmp_path, PLAN, RULE).notes)
+    calls = [goal_events(1, 1, None, 10.0), goal_events(1, 1, None, 50.0), goal_events(1, 1, 8.0, 90.0)]
+    calls += [goal_events(2, 2, None, 200.0), goal_events(2, 2, 8.0, 300.0)]
+    measures(*calls, study=tmp_path)
+    notes = read_study(tmp_path, PLAN, RULE).notes
+    assert any("3 calls were repeated" in note and note.endswith("spot 1 2, spot 2 1") for note in notes)
+
+
 def test_a_power_cut_costs_one_line(tmp_path: Path) -> None:
     path = write_trial(tmp_path, begin(PLAN, P01, 1), *goal_events(1, 1, 8.0, 10.0))
     path.write_text(path.read_text() + '{"event": "ca')
@@ -109,6 +121,42 @@ def test_a_power_cut_costs_one_line(tmp_path: Path) -> None:
         ),
         ([begin(PLAN, P01, 1), *goal_events(3, 1, None, 1.0)], "goal 3 at spot 1; the plan has 2"),
         ([begin(PLAN, P01, 1), *goal_events(1, 1, -5.0, 9.0)], "is before the call"),
+        *(
+            ([begin(PLAN, P01, 1), goal_events(1, 1, None, 1.0)[0] | changes], says)
+            for changes, says in (
+                ({"path_m": 1.1e6}, "is not from 0 to 1e.06 m"),
+                ({"path_m": -1}, "path_m -1 is not from 0"),
+                ({"spot": 1.9}, "1.9 is not a whole number"),
+                ({"spot": True}, "True is not a whole number"),
+                ({"spot": "2"}, "'2' is not a whole number"),
+                ({"goal": 1.0}, "1.0 is not a whole number"),
+                ({"spot": 3}, "goal 1 at spot 3; the plan has 2"),
+                ({"robot_m": [1, -10001]}, "is beyond 10000 m"),
+                ({"cube_m": [1e308, 1]}, "is beyond 10000 m"),
+            )
+        ),
+        (
+            [begin(PLAN, P01, 1), *goal_events(1, 1, 5.0, 9.0)[:2], STANDS | {"path_m": -0.1}],
+            "path_m -0.1 is not from 0",
+        ),
+        (
+            [begin(PLAN, P01, 1), *goal_events(1, 1, 5.0, 9.0)[:2], STANDS | {"robot_m": [2e4, 1]}],
+            "is beyond 10000 m",
+        ),
+        (
+            [
+                *(begin(PLAN, P01, 1), *goal_events(1, 2, 5.0, 9.0), *goal_events(2, 2, 5.0, 99.0)),
+                {"event": "end", "t_s": 200.0},
+            ],
+            "goals share spot 2; the plan visits each spot once",
+        ),
+        *(
+            (
+                [begin(PLAN, P01, 1), *goal_events(1, 1, None, 9.0), STATUS | {"status": status}],
+                "status is not printable text",
+            )
+            for status in ("ok\n\n# x", "", "\x1b[2J", 3, "x" * 101)
+        ),
         (
             [begin(PLAN, P01, 1), *goal_events(1, 1, 5.0, 9.0), {"event": "end"}],
             "complete, with 1 of 2 goals",
