@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -26,18 +25,13 @@ if TYPE_CHECKING:
     from share.recordings.session import Session
 
 
-class _Seconds(click.FloatRange):
-    """A range that also refuses NaN, which compares with neither bound."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        number = float(super().convert(value, param, ctx))
-        if math.isnan(number):
-            self.fail(f"'{value}' is not a number of seconds", param, ctx)
-        return number
-
-
 @click.command()
-@click.option("--seconds", type=_Seconds(3, 600), default=20, help="Length of the run, s.")
+@click.option(
+    "--seconds",
+    type=options.NumberRange(3, 600, "a number of seconds"),
+    default=20,
+    help="Length of the run, s.",
+)
 @options.policy
 @options.link
 @options.true_error

@@ -127,14 +127,14 @@ def edge(
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
     served = _PageOptions(http, view, headset, headset_cert, headset_key, mounts, http_token, out)
-    served.check(bind, is_streamed)
+    token = served.check(bind, is_streamed)
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, edge_key_pair, max_message_bytes)))
         # before any process starts: the port may be in use
         access = None if headset is None else _edge_access(link.endpoint, edge_key_pair, allowed)
-        pages = _EdgePages(stack, stderr, served, access)
+        pages = _EdgePages(stack, stderr, served, token, access)
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         on_event = partial(_print_event, stderr, verbose)
         run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed)
@@ -161,14 +161,11 @@ class _PageOptions(NamedTuple):
     token_file: Path | None
     out: Path | None
 
-    def token(self) -> str | None:
-        """Return the token of the status page and the live room. Raises UsageError."""
+    def check(self, bind: str, is_streamed: bool) -> str | None:
+        """Return the token of the status page and the live room. Raises UsageError, also if an option lacks
+        another, one names no address, or two name the same."""
         from share.net.http_guard import read_token
 
-        return None if self.token_file is None else read_token(self.token_file)
-
-    def check(self, bind: str, is_streamed: bool) -> None:
-        """Raise UsageError if an option lacks another, one names no address, or two name the same."""
         if self.headset is None and (self.certificate or self.certificate_key or self.mounts):
             raise UsageError("--headset-cert, --headset-key, --mount: they are for --headset; give it too")
         if self.headset is not None and is_streamed:
@@ -177,19 +174,20 @@ class _PageOptions(NamedTuple):
             )
         if self.token_file is not None and self.http is None and self.view is None:
             raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
+        token = None if self.token_file is None else read_token(self.token_file)
         named: dict[str, Address] = {}
-        for option, address in self._addresses(bind).items():
+        for option, address in self._addresses(bind, token).items():
             for other, taken in named.items():
                 if address == taken and address.port:
                     text = f"{other} and {option} name the same port {address.port}; give each its own"
                     raise UsageError(text)
             named[option] = address
+        return token
 
-    def _addresses(self, bind: str) -> dict[str, Address]:
+    def _addresses(self, bind: str, token: str | None) -> dict[str, Address]:
         from share.net.http_guard import http_address
         from share.net.transport import parse_address
 
-        token = self.token()
         addresses = {"--bind": parse_address(bind, bind=True)}
         for option, text in (("--http", self.http), ("--view", self.view)):
             if text is not None:
@@ -226,7 +224,12 @@ class _EdgePages:
     or missing, TransportError for a port in use."""
 
     def __init__(
-        self, stack: ExitStack, stderr: Stderr, served: _PageOptions, access: EdgeAccess | None
+        self,
+        stack: ExitStack,
+        stderr: Stderr,
+        served: _PageOptions,
+        token: str | None,
+        access: EdgeAccess | None,
     ) -> None:
         from share.runtime.plan import Plan
         from share.runtime.status_server import StatusServer
@@ -234,7 +237,7 @@ class _EdgePages:
 
         self.run: EdgeRun | None = None
         self.observers: list[EdgeObserver] = []
-        self._stack, self._token_file, token = stack, served.token_file, served.token()
+        self._stack, self._token_file = stack, served.token_file
         self._stderr, self._addresses, self._is_guarded = stderr, list[str](), token is not None
         self._room: LiveRoom | None = None
         self._headset: HeadsetPage | None = None

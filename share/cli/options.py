@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from inspect import cleandoc
@@ -105,6 +106,20 @@ true_error = click.option(
     "--true-error", is_flag=True, help="Agents report their error against ground truth to the edge."
 )
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+
+
+class NumberRange(click.FloatRange):
+    """A range that also refuses NaN, which compares with neither bound. noun: of what it takes."""
+
+    def __init__(self, low: float, high: float, noun: str = "a number") -> None:
+        super().__init__(low, high)
+        self._noun = noun
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"'{value}' is not {self._noun}", param, ctx)
+        return number
 
 
 class _Frames(click.ParamType[slice]):

@@ -37,16 +37,6 @@ def study() -> None:
     """
 
 
-class _Amount(click.FloatRange):
-    """A number within a range, and no NaN, which click lets pass."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        number: float = super().convert(value, param, ctx)
-        if math.isnan(number):
-            self.fail(f"'{value}' is not a number", param, ctx)
-        return number
-
-
 class _Numbers(click.ParamType[tuple[float, ...]]):
     """Two numbers with a character between them."""
 
@@ -83,8 +73,10 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     "--corner", type=_Numbers(",", "-2,-2"), default="0,0", metavar="X,Y", help="Its least x and y, m."
 )
 @click.option("--spots", type=click.IntRange(1, 200), default=10, help="Spots to draw.")
-@click.option("--margin", type=_Amount(0, 100), default=0.5, help="From the edge of the floor, m.")
-@click.option("--apart", type=_Amount(0, 100), default=0.8, help="Spots from each other, m.")
+@click.option(
+    "--margin", type=options.NumberRange(0, 100), default=0.5, help="From the edge of the floor, m."
+)
+@click.option("--apart", type=options.NumberRange(0, 100), default=0.8, help="Spots from each other, m.")
 @click.option(
     "--spots-file",
     metavar="FILE",
@@ -100,8 +92,8 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--questions", metavar="FILE", type=options.EXISTING_FILE, help="Questions of your own, YAML `questions`."
 )
-@click.option("--distance", type=_Amount(0.01, 100), default=0.5, help="Of success, m.")
-@click.option("--timeout", type=_Amount(0.1, 3600), default=30.0, help="Of success, s.")
+@click.option("--distance", type=options.NumberRange(0.01, 100), default=0.5, help="Of success, m.")
+@click.option("--timeout", type=options.NumberRange(0.1, 3600), default=30.0, help="Of success, s.")
 @click.option(
     "--seed", type=click.IntRange(0, 2**63), help="Of spots and orders, not letters.  [default: drawn]"
 )
@@ -245,8 +237,8 @@ def unblind(folder: Path, key_file: Path, early: bool) -> None:
     metavar="NAME=LOW:HIGH",
     help="With a CSV: the range of a measure, beyond which a value is an error; may be repeated.",
 )
-@click.option("--distance", type=_Amount(0.01, 100), help="Of success, m.  [default: the plan's]")
-@click.option("--timeout", type=_Amount(0.1, 3600), help="Of success, s.  [default: the plan's]")
+@click.option("--distance", type=options.NumberRange(0.01, 100), help="Of success, m.  [default: the plan's]")
+@click.option("--timeout", type=options.NumberRange(0.1, 3600), help="Of success, s.  [default: the plan's]")
 @click.option("--out", metavar="DIR", type=options.PATH, help="Folder for the report.")
 @options.as_json
 def analyze(
@@ -287,7 +279,7 @@ def analyze(
     files = [] if out is None else write_report(found, table, rule, out)
     if as_json:
         success = None if rule is None else asdict(rule)
-        click.echo(json.dumps(nan_to_none({"success": success} | _plain(asdict(found)))))
+        click.echo(json.dumps(nan_to_none({"success": success} | asdict(found))))
         return
     for line in [*coverage_lines(found), *([] if rule is None else [rule_line(rule)])]:
         click.echo(f"* {line}")
@@ -311,17 +303,6 @@ def _print_tables(found: StudyAnalysis) -> None:
         if len(rows) > 1:
             click.echo(f"\n{title}\n{aligned_table(rows)}")
     click.echo()
-
-
-def _plain(value: Any) -> Any:
-    """Return nested data with arrays as lists."""
-    import numpy as np
-
-    if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _refuse(is_wrong: bool, text: str) -> None:

@@ -51,7 +51,7 @@ def own_format_errors(path: Path) -> Iterator[None]:
 
 
 def nan_to_none(value: Any) -> Any:
-    """Return plain data with None for NaN, which JSON lacks."""
+    """Return plain data, or arrays, with None for NaN, which JSON lacks, and lists for arrays."""
     match value:
         case float() if math.isnan(value):
             return None
@@ -59,6 +59,8 @@ def nan_to_none(value: Any) -> Any:
             return {name: nan_to_none(one) for name, one in value.items()}
         case list() | tuple():
             return [nan_to_none(one) for one in value]
+        case _ if hasattr(value, "tolist"):  # of numpy, which not all commands import
+            return nan_to_none(value.tolist())
         case _:
             return value
 

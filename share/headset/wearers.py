@@ -251,15 +251,14 @@ class WearerRegistry:
         if hello.session is not None:
             session = unseal(self._key, hello.session, time.time())
             if not self._ledger.is_newest(session):
-                raise SessionOverError(f"another headset has paired as '{session.name}' since; pair again")
+                raise _replaced(session.name)
             rights = self._access.rights_of(session.name)
         else:
             session, rights = self._pair(hello, address)
         wearer = self._wearers.get(session.name)
         if wearer is not None and wearer.session.nonce != session.nonce:
             if (seat := wearer.seat) is not None:  # else its STOP would reach nobody, without a word
-                reason = f"another headset has paired as '{session.name}' since; pair again"
-                self._dismiss(wearer, seat, SessionOverError(reason))
+                self._dismiss(wearer, seat, _replaced(session.name))
             self.remove(wearer)
             wearer = None
         if wearer is None:
@@ -327,3 +326,7 @@ class WearerRegistry:
             self.remove(wearer)
         for wearer in wearers:
             wearer.join(0.5)
+
+
+def _replaced(name: str) -> SessionOverError:
+    return SessionOverError(f"another headset has paired as '{name}' since; pair again")

@@ -515,13 +515,18 @@ def test_a_server_that_is_killed_comes_back_and_knows_its_wearers(
     assert "headset page: 'ann' has paired, with the device of 'ann'" in told
 
 
-def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomServer) -> None:
+def paired_twice(site: Path, edge: RoomServer) -> tuple[str, str]:
+    """Return ann's older and newer session of a server that has ended."""
     with closing(serve(site, edge.address)) as page:
         with paired(page, "ann") as first:
             old = first.seen[0]["session"]
         assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": False})["is_connected"])
         with paired(page, "ann") as second:
-            new = second.seen[0]["session"]
+            return old, second.seen[0]["session"]
+
+
+def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomServer) -> None:
+    old, new = paired_twice(site, edge)
     with closing(serve(site, edge.address)) as page:
         code(page)
         for session, answer in ((old, "refused"), (new, "welcome"), (old, "refused")):
@@ -533,12 +538,7 @@ def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomSer
 
 def test_a_page_whose_place_a_newer_session_takes_is_told(site: Path, edge: RoomServer) -> None:
     """What the server knew of sessions is lost, so the older page was let in; its STOP reached nobody."""
-    with closing(serve(site, edge.address)) as page:
-        with paired(page, "ann") as first:
-            old = first.seen[0]["session"]
-        assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": False})["is_connected"])
-        with paired(page, "ann") as second:
-            new = second.seen[0]["session"]
+    old, new = paired_twice(site, edge)
     for file in default_folder().glob(LEDGER_FILE):
         file.unlink()
     with closing(serve(site, edge.address)) as page, PageClient(page.endpoint) as older:

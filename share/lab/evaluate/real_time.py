@@ -126,19 +126,6 @@ class Pages:
 PAGE_LINES = ("status at ", "live room at ")  # of the edge
 
 
-def play_in_real_time(
-    session: Session,
-    seconds: float,
-    options: RunOptions,
-    out: Path,
-    show: Callable[[Progress], None],
-    pages: Pages | None = None,
-) -> None:
-    """Run `session` in real time; see `played_in_real_time`."""
-    with played_in_real_time(session, seconds, options, out, show, pages):
-        pass
-
-
 @contextmanager
 def played_in_real_time(
     session: Session,

@@ -20,7 +20,7 @@ from share.errors import ConfigError, DataError, UsageError
 from share.files.json_file import read_json, to_plain
 from share.files.writing import atomic_write, new_folder
 from share.lab.evaluate.provenance import code_digest, describe_machine
-from share.lab.evaluate.real_time import Pages, Progress, RunOptions, play_in_real_time
+from share.lab.evaluate.real_time import Pages, Progress, RunOptions, played_in_real_time
 from share.lab.evaluate.virtual_time import play_in_virtual_time
 from share.plain_data import from_mapping, to_mapping
 from share.recordings.session import Session, read_session
@@ -87,7 +87,8 @@ def run_trial(
         if options.virtual:
             play_in_virtual_time(session, seconds, play_options, work, show)
         else:
-            play_in_real_time(session, seconds, play_options, work, show, pages)
+            with played_in_real_time(session, seconds, play_options, work, show, pages):
+                pass
         record = {
             "schema": SCHEMA,
             "session": str(session.folder.resolve()),

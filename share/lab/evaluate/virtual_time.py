@@ -55,7 +55,7 @@ _TRUE_ERROR = "truth"
 def play_in_virtual_time(
     session: Session, seconds: float, options: RunOptions, out: Path, show: Callable[[Progress], None]
 ) -> dict[str, Path]:
-    """Play `session` as `share.lab.evaluate.real_time.play_in_real_time` does, with the same files except the
+    """Play `session` as `share.lab.evaluate.real_time.played_in_real_time` does, with the same files but the
     processes' logs.
 
     Raises UsageError where a recording cannot be tracked or the policy is `streamed`.
