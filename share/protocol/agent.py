@@ -180,8 +180,7 @@ class AgentProtocol:
                 candidate = replace(candidate, image=with_less_quality(candidate.image, quality))
             keyframe = self._keyframe_chain.make_keyframe(candidate, frame.stamp_ns)
             self._ledger.add(LedgerEntry(keyframe, frame.index, frame.arrived_ns))
-            self._self_evaluation.add_keyframe(keyframe, frame, self._pace.next_send_ns(self._now_ns))
-            self._send_evaluation(keyframe.id)
+            self._self_evaluation.add_keyframe(keyframe, frame)
         else:
             self._counts["drop_rate"] += 1
         self._finish_frame(frame, sent)
@@ -331,6 +330,9 @@ class AgentProtocol:
         if self._pace.next_send_ns(self._now_ns) > self._now_ns:
             return
         for entry in self._ledger.take_due(self._now_ns, self._pace.window):
+            if entry.attempts == 1:
+                self._self_evaluation.delay.mark_sent(entry.keyframe.id, self._now_ns)
+                self._send_evaluation(entry.keyframe.id)  # just before: the edge sees what the keyframe takes
             self._send_frames(encode(entry.keyframe), entry.keyframe.id)
 
     @property

@@ -36,24 +36,30 @@ class CorrectionDelay:
 
     def __init__(self) -> None:
         self._to_ack, self._to_correction = FilteredDelay(), FilteredDelay()
-        self._waiting: dict[int, tuple[int, int]] = {}  # arrival of the frame and sending, by keyframe id
+        self._waiting: dict[int, int] = {}  # arrival of the frame, by keyframe id
+        self._sent_ns: dict[int, int] = {}  # of those that wait and were sent, by keyframe id
         self._acknowledged_ms: dict[int, float] = {}  # after the frame's arrival, by id, of the newest
         self._newest_ack_ms = 0.0
 
-    def add_keyframe(self, keyframe: int, arrived_ns: int, sent_ns: int) -> None:
-        """Add a keyframe that is sent now."""
+    def add_keyframe(self, keyframe: int, arrived_ns: int) -> None:
+        """Add a keyframe that is made now."""
         if len(self._waiting) < _MAX_WAITING:
-            self._waiting[keyframe] = arrived_ns, sent_ns
+            self._waiting[keyframe] = arrived_ns
+
+    def mark_sent(self, keyframe: int, now_ns: int) -> None:
+        """Record that a keyframe is sent now, for the first time in this session of the edge."""
+        if keyframe in self._waiting:
+            self._sent_ns[keyframe] = now_ns
 
     def acknowledge(self, next_keyframe: int, now_ns: int) -> list[float]:
         """Record that the edge has all keyframes below an id. Return what each new one took since it was
         sent, ms."""
         acks_ms = []
         for keyframe in [keyframe for keyframe in self._waiting if keyframe < next_keyframe]:
-            arrived_ns, sent_ns = self._waiting.pop(keyframe)
-            self._acknowledged_ms[keyframe] = (now_ns - arrived_ns) / 1e6
+            self._acknowledged_ms[keyframe] = (now_ns - self._waiting.pop(keyframe)) / 1e6
             self._to_ack.add(self._acknowledged_ms[keyframe], now_ns)
-            acks_ms.append(max(0, now_ns - sent_ns) / 1e6)  # it may be held, and the edge may lie
+            # the edge may acknowledge what was never sent
+            acks_ms.append((now_ns - self._sent_ns.pop(keyframe, now_ns)) / 1e6)
             self._newest_ack_ms = acks_ms[-1]
         while len(self._acknowledged_ms) > _MAX_ACKNOWLEDGED:
             del self._acknowledged_ms[next(iter(self._acknowledged_ms))]
@@ -73,17 +79,13 @@ class CorrectionDelay:
     def ack_ms(self, now_ns: int) -> float:
         """Return how long the newest acknowledgement took, or how long one is overdue, if longer; 0 before
         the first keyframe."""
-        waiting = [(now_ns - sent_ns) / 1e6 for _, sent_ns in self._oldest_waiting()]
-        return max([self._newest_ack_ms, *waiting])
+        sent_ns = min(self._sent_ns.values(), default=now_ns)
+        return max(self._newest_ack_ms, (now_ns - sent_ns) / 1e6)
 
     def waiting_ms(self, now_ns: int) -> float:
         """Return how long ago the frame of the oldest keyframe that is not acknowledged arrived; 0 without
         one."""
-        return max([(now_ns - arrived_ns) / 1e6 for arrived_ns, _ in self._oldest_waiting()], default=0.0)
-
-    def _oldest_waiting(self) -> list[tuple[int, int]]:
-        """Return the times of the keyframe that has waited longest; none if nothing waits."""
-        return [next(iter(self._waiting.values()))] if self._waiting else []
+        return (now_ns - next(iter(self._waiting.values()), now_ns)) / 1e6
 
 
 _MAX_COMPUTING = 64  # newest keyframes of a run that a correction may still answer

@@ -201,7 +201,8 @@ class EdgeProtocol:
     # ------------------------------------------------------------------ keyframes and the map
 
     def _on_keyframe(self, peer: Peer, keyframe: Keyframe) -> None:
-        if peer.reorder_buffer.is_new(keyframe.id):
+        # an agent that cannot evaluate yet sends nothing just before its keyframe
+        if peer.counts["evaluations"] and peer.reorder_buffer.is_new(keyframe.id):
             peer.arrival_ms = peer.since_last_ns / 1e6
         applicable = self._reorder(peer, keyframe)
         for ready in applicable:

@@ -202,10 +202,10 @@ class SelfEvaluation:
         """Add the time from a frame's arrival to its candidate, ms."""
         self._processing_ms = exponential_average(self._processing_ms, ms)
 
-    def add_keyframe(self, keyframe: Keyframe, frame: ev.FrameTracked, sent_ns: int) -> None:
-        """Add a keyframe made of a frame, to be sent at `sent_ns`."""
+    def add_keyframe(self, keyframe: Keyframe, frame: ev.FrameTracked) -> None:
+        """Add a keyframe made of a frame."""
         self.drift.add_keyframe(keyframe, frame.arrived_ns)
-        self.delay.add_keyframe(keyframe.id, frame.arrived_ns, sent_ns)
+        self.delay.add_keyframe(keyframe.id, frame.arrived_ns)
         self.local_cm = frame.error_cm
 
     def evaluation(

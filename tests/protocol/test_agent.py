@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -89,8 +90,8 @@ def test_keyframes_are_held_for_as_long_as_the_welcome_says() -> None:
     tell(agent, m.Pong(1, 0, 1, 1, SESSION), 206 * MS)
     tell(agent, m.Ack(1), 235 * MS)
     told = agent.evaluation(0, 240 * MS)
-    assert told is None or told.ack_ms == pytest.approx(34.0)  # on the air, not while it was held
-    assert agent._self_evaluation.delay.ack_ms(240 * MS) == pytest.approx(34.0)
+    assert told is None or told.ack_ms == pytest.approx(30.0)  # on the air, not while it was held
+    assert agent._self_evaluation.delay.ack_ms(240 * MS) == pytest.approx(30.0)
 
 
 def test_an_unanswered_hello_prints_one_line() -> None:
@@ -548,6 +549,20 @@ def test_an_evaluation_includes_the_sigma_of_the_correction() -> None:
     # of one motion, after that of odometry in the map
     cov = se3.compose_cov(pose(3), COV, COV)
     assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])))
+
+
+def test_each_keyframe_follows_its_evaluation() -> None:
+    """The edge sees by that how long the keyframe takes, also of one that was held."""
+    agent = AgentProtocol(HELLO, Config())
+    handle(agent, ev.AgentTick(), 0)
+    effects = tell(agent, m.Welcome(SESSION, 0, 200.0), MS)
+    [ping] = only(m.Ping, effects, messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 8 * MS)
+    handle(agent, tracked(0, pose(0), candidate=True), 10 * MS)
+    messages = sent(handle(agent, ev.AgentTick(), 205 * MS))
+    messages += sent(handle(agent, tracked(1, pose(1), candidate=True), 300 * MS))
+    before = [(a, b.id) for a, b in pairwise(messages) if isinstance(b, Keyframe)]
+    assert [(evaluation.keyframe, k) for evaluation, k in before] == [(0, 0), (1, 1)]
 
 
 def test_a_keyframe_that_the_link_refuses_does_not_count_as_sent() -> None:

@@ -11,7 +11,8 @@ MS = 1_000_000
 
 def served(delay: CorrectionDelay, keyframe: int, at_ms: int, ack_ms: int, corrected_ms: int | None) -> None:
     """A keyframe whose frame arrived at `at_ms`, sent 10 ms later."""
-    delay.add_keyframe(keyframe, at_ms * MS, (at_ms + 10) * MS)
+    delay.add_keyframe(keyframe, at_ms * MS)
+    delay.mark_sent(keyframe, (at_ms + 10) * MS)
     delay.acknowledge(keyframe + 1, (at_ms + ack_ms) * MS)
     if corrected_ms is not None:
         delay.correct(keyframe, corrected_ms, (at_ms + corrected_ms) * MS)
@@ -41,8 +42,9 @@ def test_a_keyframe_that_leads_to_no_correction_counts_by_its_acknowledgement() 
 def test_a_keyframe_that_nobody_acknowledges_is_as_late_as_it_is() -> None:
     delay = CorrectionDelay()
     served(delay, 0, 0, 40, 75)
-    delay.add_keyframe(1, 1000 * MS, 1010 * MS)
-    delay.add_keyframe(2, 2000 * MS, 2010 * MS)
+    for k in (1, 2):
+        delay.add_keyframe(k, 1000 * k * MS)
+        delay.mark_sent(k, (1000 * k + 10) * MS)
     assert delay.ms(1020 * MS) == pytest.approx(75)
     assert delay.ms(4000 * MS) == pytest.approx(3000 + 35)
     assert delay.waiting_ms(4000 * MS) == pytest.approx(3000)
@@ -82,9 +84,10 @@ def test_the_edge_holds_acknowledgements_for_its_disk() -> None:
 def test_memory_is_bounded() -> None:
     delay, part = CorrectionDelay(), ComputationDelay()
     for k in range(5000):
-        delay.add_keyframe(k, k * MS, k * MS)
+        delay.add_keyframe(k, k * MS)
+        delay.mark_sent(k, k * MS)
         part.add_keyframe(k, k * MS)
-    assert len(delay._waiting) <= 1000 and len(part._received_ns) <= 64
+    assert len(delay._waiting) <= 1000 and len(delay._sent_ns) <= 1000 and len(part._received_ns) <= 64
     delay.acknowledge(5000, 6000 * MS)
     assert len(delay._acknowledged_ms) <= 64
 
@@ -92,6 +95,16 @@ def test_memory_is_bounded() -> None:
 def test_a_keyframe_that_is_acknowledged_before_it_is_sent_took_no_time() -> None:
     """It is held, and the edge says that it has it."""
     delay = CorrectionDelay()
-    delay.add_keyframe(0, 0, 10 * 10**9)
+    delay.add_keyframe(0, 0)
     assert delay.acknowledge(1, 10**9) == [0.0]
-    assert delay.ack_ms(2 * 10**9) == 0.0
+    delay.mark_sent(0, 10 * 10**9)
+    assert delay.ack_ms(20 * 10**9) == 0.0
+
+
+def test_what_a_keyframe_is_held_is_no_time_on_the_air() -> None:
+    delay = CorrectionDelay()
+    delay.add_keyframe(0, 0)
+    assert delay.ack_ms(500 * MS) == 0.0
+    delay.mark_sent(0, 550 * MS)
+    assert delay.acknowledge(1, 560 * MS) == [10.0]
+    assert delay.ms(560 * MS) == 560.0

@@ -210,8 +210,10 @@ class Simulation:
 
         def on_air_done() -> None:
             arrival_ns = member.up.arrival_ns(size, self.now_ns) + self._draw(self._delays.receive)
+            member.received_ns = max(member.received_ns, arrival_ns)  # in the order of the link
             self._schedule(
-                arrival_ns - self.now_ns, lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames))
+                member.received_ns - self.now_ns,
+                lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames)),
             )
 
         self._over_the_air(member, member.name, size, on_air_done)
@@ -357,7 +359,7 @@ def _result_or_error(action: Callable[[], object]) -> object:
 
 class SimulatedRun:
     """A run of an agent, its remaining frames and its network. `busy_until_ns`: when it has tracked all
-    frames that arrived so far."""
+    frames that arrived so far. `received_ns`: when the edge has received all that it sent so far."""
 
     def __init__(
         self,
@@ -371,4 +373,4 @@ class SimulatedRun:
         self.machine, self.incoming, self.network = machine, incoming, network
         self.up = Channel(network.up, network.round_trip_ms, rngs[0])
         self.down = Channel(network.down, network.round_trip_ms, rngs[1])
-        self.busy_until_ns = self.frames_count = 0
+        self.busy_until_ns = self.received_ns = self.frames_count = 0

@@ -12,15 +12,19 @@ from helpers.room_simulation import MS, tracked_frames
 
 from share.config import Config, EdgeConfig
 from share.geometry.camera import Camera
-from share.lab.evaluate.emulated_network import NETWORK_PRESETS
+from share.lab.evaluate.emulated_network import NETWORK_PRESETS, NetworkModel
 from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
 from share.lab.evaluate.simulation import Simulation
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
 from share.mapping.steps import AlignStep, DescribeStep, IndexStep, LookupStep, QueryStep, VerifyStep
+from share.protocol import edge_events as ed
+from share.protocol.common_events import SendToEdge
 from share.store.map_store import MapStore
 from share.types import KeyframeImage, View
+from share.wire.codec import decode, encode
+from share.wire.messages import Evaluation, Ping
 
 pytestmark = pytest.mark.long
 
@@ -126,6 +130,43 @@ def test_all_agents_are_tracked_and_corrected_in_one_map() -> None:
         assert min(corrected_ms(room, name)) > 4 + 3 + 2 * 1.0 + 3 + 4 + 14 - 15
         both = [*track_ms(room, name), *corrected_ms(room, name)]
         assert log.report()["latency_ms"]["mean"] == pytest.approx(np.mean(both))
+
+
+def test_messages_arrive_in_order_however_long_the_edge_takes_to_receive_one() -> None:
+    room = world(seconds=0.0, receive=Delay(2.0, 40.0))
+    received: list[tuple[bytes, int]] = []
+    edge_handle = room.edge.handle
+
+    def handle(event: ed.EdgeEvent, now_ns: int) -> list[ed.EdgeEffect]:
+        if isinstance(event, ed.PeerMessageReceived) and isinstance(ping := decode(event.frames), Ping):
+            received.append((event.peer_id, ping.sequence))
+        return edge_handle(event, now_ns)
+
+    room.edge.handle = handle  # type: ignore[method-assign]
+    for sequence in range(100):
+        for member in room._members.values():
+            room._send_up(member, encode(Ping(sequence, 0)))
+    room.run(10.0)
+    for peer in room._members:
+        sequences = [sequence for sender, sequence in received if sender == peer][:100]
+        assert sequences == sorted(sequences) and len(sequences) == 100
+
+
+def test_loopback_is_no_scarce_air() -> None:
+    """Nor are the first keyframes, which the edge holds, and whose evaluation arrives just before them."""
+    people = [Person(name, ROOM, phase, k) for k, (name, phase) in enumerate([("ann", 0.0), ("bob", 0.5)])]
+    agents = [(person.hello, tracked_frames(person, 6.0), NetworkModel()) for person in people]
+
+    def on_effect(name: str, effect: object) -> None:
+        if isinstance(effect, SendToEdge) and isinstance(message := decode(effect.frames), Evaluation):
+            assert message.ack_ms < 10.0
+
+    settings = Config(edge=EdgeConfig(policy="share"))
+    room = Simulation(settings, agents, ProcessingDelays(), 3, on_effect=on_effect)
+    room.run(7.0)
+    peers = list(room.edge._registry.values())
+    assert {peer.name: peer.arrival_ms < 3.0 for peer in peers} == {"ann": True, "bob": True}
+    assert [peer.grant.jpeg_quality for peer in peers if peer.grant] == [None, None]
 
 
 def test_a_run_depends_on_its_seed_alone() -> None:
