@@ -17,7 +17,9 @@ def drawn(n: int, seed: int = 0):
     T = se3.exp(rng.normal(0, 1, (n, 6)))
     noise = rng.multivariate_normal(np.zeros(6), COV, n)
     noise[0] = 0
-    return T, np.broadcast_to(COV, (n, 6, 6)), T @ se3.exp(noise)
+    cov = np.tile(COV, (n, 1, 1))
+    cov[0] = 0
+    return T, cov, T @ se3.exp(noise)
 
 
 def level(yaw: float, shift):
@@ -27,18 +29,32 @@ def level(yaw: float, shift):
 def test_truth_drawn_from_the_covariance_is_consistent_in_any_world():
     T, cov, true = drawn(4000)
     found = consistency.deviations(T, cov, level(2.5, [3.0, -7.0, 1.0]) @ true, np.zeros(len(T), np.int64))
+    assert found.is_aligned.tolist() == [True] + [False] * 3999
     for part in (slice(0, 3), slice(3, 6)):
-        mean = consistency.nees(found.errors[:, part], found.cov[:, part, part]).mean()
+        mean = consistency.nees(found.errors[1:, part], found.cov[1:, part, part]).mean()
         assert mean == pytest.approx(3, abs=0.15)  # four sigma of the mean of 4000
-        assert consistency.share_within(found.errors[:, part], found.sigmas[:, part]) == pytest.approx(
+        assert consistency.share_within(found.errors[1:, part], found.sigmas[1:, part]) == pytest.approx(
             0.9973**3, abs=0.006
         )
+
+
+def test_an_unsure_first_pose_makes_no_later_one_inconsistent():
+    """Odometry may begin before its first pose, which is known worse than those that follow."""
+    T, cov, true = drawn(4000)
+    rng = np.random.default_rng(1)
+    unsure = true[0] @ se3.exp(rng.multivariate_normal(np.zeros(6), 100 * COV))
+    T, true = np.concatenate([T[:1], T]), np.concatenate([unsure[None], true])
+    found = consistency.deviations(
+        T, np.concatenate([100 * COV[None], cov]), true, np.zeros(len(T), np.int64)
+    )
+    assert found.is_aligned.nonzero()[0].tolist() == [1]
+    assert consistency.nees(found.errors[2:], found.cov[2:]).mean() == pytest.approx(6, abs=0.25)
 
 
 def test_too_small_a_covariance_raises_the_nees():
     T, cov, true = drawn(2000)
     found = consistency.deviations(T, cov / 4, true, np.zeros(len(T), np.int64))
-    assert consistency.nees(found.errors[:, 3:], found.cov[:, 3:, 3:]).mean() == pytest.approx(12, rel=0.1)
+    assert consistency.nees(found.errors[1:, 3:], found.cov[1:, 3:, 3:]).mean() == pytest.approx(12, rel=0.1)
 
 
 def test_deviations_are_estimate_minus_truth_along_odom():

@@ -138,11 +138,12 @@ def accuracy(source: Source, run: TrackedRun, found: Series) -> dict[str, float 
 
 def consistency(found: Deviations) -> Iterator[float]:
     """Yield, of position, then orientation: mean NEES of three axes (3 is consistent) and share of frames
-    within 3 sigma on each axis. The first pose, at which the truth is aligned, is left out."""
+    within 3 sigma on each axis. Poses at which the truth is aligned are left out."""
+    rest = ~found.is_aligned
     for part in (slice(3, 6), slice(0, 3)):
-        errors, cov = found.errors[1:, part], found.cov[1:, part, part]
+        errors, cov = found.errors[rest, part], found.cov[rest, part, part]
         yield float(nees(errors, cov).mean())
-        yield share_within(errors, found.sigmas[1:, part])
+        yield share_within(errors, found.sigmas[rest, part])
 
 
 def _percentile(values: list[float], q: float) -> float | None:
