@@ -81,6 +81,7 @@ def test_inflated_noise_is_written_and_stated(share, table, tmp_path):
     assert "2 times what was measured" in (tmp_path / "two" / "kalibr_imu_chain.yaml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_serial_number_of_the_recording_is_written(share, tmp_path):
     with Recorder(tmp_path / "rest.mcap", load_profile("euroc").rig(), serial="0123") as recorder:

@@ -81,6 +81,7 @@ def test_wrong_codes_of_four_addresses_hinder_nobody_and_change_nothing() -> Non
     one.check("00000123", "ann", 600 * SECOND)
 
 
+@pytest.mark.slow
 def test_many_addresses_take_no_memory() -> None:
     one = desk()
     for k in range(5000):

@@ -103,6 +103,7 @@ def test_a_restarted_mapper_forgets_what_expired_meanwhile(
     assert sum(len(c.keys) for c in second.changes if isinstance(c, RemoveKeyframes)) == 2 * STEPS
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_a_connected_agent_whose_keyframes_expired_goes_on(tmp_path: Path) -> None:
     """Its run stays until it leaves."""

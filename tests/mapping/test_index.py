@@ -169,6 +169,7 @@ def test_words_of_removed_keyframes_are_not_counted() -> None:
         assert scores == pytest.approx(expected, rel=0.14)  # a page keeps some until it is rewritten
 
 
+@pytest.mark.slow
 def test_a_query_reads_no_more_of_a_large_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Entries, where all words are frequent."""
     rng, read = np.random.default_rng(9), Counter[int]()

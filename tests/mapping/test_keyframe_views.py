@@ -214,6 +214,7 @@ def test_without_a_map_file_everything_stays(monkeypatch: pytest.MonkeyPatch) ->
     assert all(len(views.by_node[k].view) == 30 and views.image(k) is not None for k in range(20))
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_memory_a_keyframe_with_a_map_file_is_that_of_the_index(monkeypatch: pytest.MonkeyPatch) -> None:
     """800 features and an image of 20 kB: 50 kB where they stay."""

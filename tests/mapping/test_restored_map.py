@@ -179,6 +179,7 @@ def test_a_segment_whose_run_was_lost_is_restored() -> None:
     Mapper(Config()).restore(StoredMap(segments=("ann/0",)))
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_a_merge_whose_poses_were_not_stored_is_not_published_as_before(tmp_path: Path) -> None:
     """The edge is killed within seconds of a merge: loops are stored at once, poses periodically."""

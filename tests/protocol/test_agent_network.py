@@ -90,6 +90,7 @@ def test_over_a_bad_network_every_keyframe_is_applied_once_and_in_order(
     check_applied(edge.applied, walk)
 
 
+@pytest.mark.slow
 @given(seeds, networks, st.integers(1, 12), st.integers(20, FRAMES - 20), st.integers(1, 150))
 @settings(max_examples=15, deadline=None)
 @pytest.mark.long

@@ -314,6 +314,7 @@ def counts(inbox, answer, settings, map_file):
     os._exit(3)
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_counters_continue_after_a_mapper_died(edge):
     run, _, events = edge(counts)

@@ -112,6 +112,7 @@ def test_the_first_page_can_be_lost_whole(whole, tmp_path):
     assert check_opens(path, path.read_bytes(), good) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_any_header_byte_may_be_wrong(whole, tmp_path):
     data, good = whole

@@ -164,7 +164,7 @@ def test_first_release_that_fails_is_stopped(device):
     assert "systemctl disable --now share-agent@ann" in device.asked()
 
 
-@pytest.mark.parametrize("leaves", [0, signal.SIGHUP, signal.SIGINT])
+@pytest.mark.parametrize("leaves", [0, signal.SIGHUP, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_rollback_needs_no_connection(device, leaves):
     """The connection to the device breaks, or the shell there ends, while the services are watched."""
     device.agent(device.program("1.0"))

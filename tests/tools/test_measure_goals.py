@@ -75,6 +75,7 @@ def test_pictures_are_scaled_and_cut_from_the_middle(
         tool.profile_of("small")
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_what_has_been_driven_is_not_driven_again(tool: Any, tmp_path: Path, capsys: Any) -> None:
     file = tmp_path / "goals.jsonl"

@@ -225,6 +225,7 @@ def test_a_map_without_a_keyframe_gives_its_place_up() -> None:
     assert any(isinstance(one, dr.Points) and one.name == "/points/1/0" for one in drawings)
 
 
+@pytest.mark.slow
 def test_an_event_of_a_long_session_costs_no_more(soon: None) -> None:
     """600 runs took 9 s, 4,000 keyframes with removals 104 s."""
     room = DrawnRoom()

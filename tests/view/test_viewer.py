@@ -186,6 +186,7 @@ def test_a_viewer_that_grows_too_large_is_started_again(monkeypatch: pytest.Monk
         assert told[0] == "the live room has ended (it took more than 1 MB of memory) and starts again in 1 s"
 
 
+@pytest.mark.slow
 @needs_viser
 @pytest.mark.long
 def test_a_viewer_that_hangs_is_killed_told_and_started_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,6 +59,7 @@ def two_trackers(
     return device, MocapTrajectory(stamps, tracked(rng, viewer, 72), "headset"), offset_s
 
 
+@pytest.mark.slow
 def test_mount_and_offset_are_found_and_their_sigmas_hold():
     nees, errors = [], []
     for seed in range(12):

@@ -283,6 +283,7 @@ def test_faults_of_clocks_and_cables(small, tmp_path):
     np.testing.assert_allclose(T, exact, atol=TICK)
 
 
+@pytest.mark.slow
 def test_a_counter_that_wraps_keeps_its_order(small, tmp_path):
     period, before_ns = (1 << 32) * 1000, 1_500_000_000
     offset = (period - START_NS % period - before_ns) / 1e6  # ms: wraps 1.5 s after the start

@@ -101,6 +101,7 @@ def test_keyframe_work_after_a_frame_delays_the_next_one() -> None:
     assert np.median(waits) == pytest.approx(35.0, abs=1.0)  # 85 ms each, every 50 ms
 
 
+@pytest.mark.slow
 def test_an_edge_continues_the_map_of_another_day(tmp_path: Path) -> None:
     path = tmp_path / "room.sqlite"
     with MapStore.open(path) as store:

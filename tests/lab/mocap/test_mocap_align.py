@@ -65,6 +65,7 @@ def test_a_long_gap_has_no_truth_and_a_short_one_is_bridged(done) -> None:
     assert found.seconds == pytest.approx(20 - 0.6 - 1.5, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_there_is_no_truth_in_a_gap_that_breaks_the_path() -> None:
     """12 s: too long to integrate the IMU across."""

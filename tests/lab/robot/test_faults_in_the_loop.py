@@ -54,6 +54,7 @@ def test_a_robot_arrives_where_a_wearer_points() -> None:
     assert drive.base.bumps == 0
 
 
+@pytest.mark.slow
 def test_a_map_that_joins_another_in_mid_drive_stops_the_robot_and_the_goal_is_given_again() -> None:
     drive = Drive([GOAL], ann_s=3.0)
     drive.run_until(lambda: drive.speed_m_s > 0.1, 3.0)
@@ -68,6 +69,7 @@ def test_an_edge_that_is_gone_stops_the_robot() -> None:
     stops(drive, "has received nothing from its edge for 5 s", within_s=9.0)
 
 
+@pytest.mark.slow
 def test_an_edge_that_comes_back_without_its_map_does_not_stop_a_robot_in_its_own() -> None:
     """The agent sends its keyframes again, of which the same map grows."""
     drive = alone("edge", seconds=1.0)
@@ -75,6 +77,7 @@ def test_an_edge_that_comes_back_without_its_map_does_not_stop_a_robot_in_its_ow
     assert any("the edge has restarted" in text for text in drive.texts)
 
 
+@pytest.mark.slow
 def test_an_edge_that_comes_back_without_its_map_stops_a_robot_in_a_shared_one() -> None:
     """Its agents are in maps of their own until they join anew."""
     drive = Drive([PlanarPose(6.0, 4.0, 1.0)], settings=SLOW)
@@ -88,6 +91,7 @@ def test_three_seconds_without_network_do_not_stop_the_robot() -> None:
     arrives(alone("network", seconds=3.0))
 
 
+@pytest.mark.slow
 def test_three_seconds_without_network_do_not_stop_a_robot_in_a_shared_map() -> None:
     """It is where its odometry says in the map that it had, and that is what the wearer meant."""
     drive = Drive([PlanarPose(6.0, 4.0, 1.0)], settings=SLOW, seconds=90.0)

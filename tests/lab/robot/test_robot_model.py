@@ -69,6 +69,7 @@ def test_a_base_stops_when_commands_stop() -> None:
     assert abs(drive.last.speed_m_s) < 1e-3
 
 
+@pytest.mark.slow
 def test_wheels_drift_by_their_errors_and_each_robot_has_its_own() -> None:
     """10 m: some 0.5 % of unequal diameters and 2 % of slip that averages out."""
     ends = []

@@ -38,6 +38,7 @@ def test_a_robot_that_knows_where_it_is_arrives(plain_session: Path, tmp_path: P
     assert json.loads(again.stdout)["goals"] == report["goals"]
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_a_robot_on_its_wheels_is_elsewhere_than_it_believes(plain_session: Path, tmp_path: Path) -> None:
     goals = tmp_path / "goals.txt"

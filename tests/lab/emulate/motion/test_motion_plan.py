@@ -71,6 +71,7 @@ def test_an_experiment_of_the_paper_lasts_as_long_as_the_session(warehouse):
         assert (part.path.poses(stamps) == all_of_it.path.poses(stamps)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_real_motion_is_placed(warehouse, shared_data):
     folder = shared_data / "motion" / "tumvi" / "room1"

@@ -150,6 +150,7 @@ def test_a_span_outside_the_recording_is_refused(
         open_recorded_motion(shared_data / "motion/euroc/V1_02_medium", EUROC_OPTIONS, start, seconds)
 
 
+@pytest.mark.slow
 def test_a_span_beyond_the_end_is_cut(shared_data: Path) -> None:
     path = open_recorded_motion(shared_data / "motion/euroc/V1_02_medium", EUROC_OPTIONS, 78.0, 60.0).path
     assert (path.end_ns - path.start_ns) * 1e-9 == pytest.approx(5.5, abs=0.1)

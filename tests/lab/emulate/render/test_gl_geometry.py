@@ -141,7 +141,9 @@ def test_drawing_is_deterministic(camera, boxes):
     assert boxes.depth(camera, moments[0]).tobytes() == again.depth(camera, moments[0]).tobytes()
 
 
-@pytest.mark.parametrize("camera", [D435I, EUROC], ids=["d435i", "euroc"])
+@pytest.mark.parametrize(
+    "camera", [D435I, pytest.param(EUROC, marks=pytest.mark.slow)], ids=["d435i", "euroc"]
+)
 def test_tracks_follow_the_scene(camera):
     renderer, errors = GlRenderer(furnished(60)), []
     for k in range(6):
