@@ -234,6 +234,11 @@ class SelfEvaluation:
 _MAX_MOTIONS = 100  # keyframes since the last answered one; the motion of older ones is merged
 
 
+# how far a random walk ends from its start, beside its RMS about the aligned truth: sqrt(10) on a straight path,
+# sqrt(6) without rotation; of 22 agents, 0.5 to 20 s, 2.6 to 3.3 (docs/understand/scheduling.md)
+WALK_PER_LOCAL = 2.9
+
+
 class DriftEstimator:
     """Expected drift of odometry since the newest keyframe that a correction answered. Times: agent's clock,
     ns."""
@@ -265,13 +270,14 @@ class DriftEstimator:
     def expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
         """Return the expected position error of the newest sent keyframe, cm; None before the first.
 
-        local_cm: error of odometry within `WINDOW_S` (`share.metrics.local_error`), scaled as a random walk.
-        None: use the covariances of odometry.
+        local_cm: error of odometry within `WINDOW_S` (`share.metrics.local_error`), from which the drift of a
+        random walk follows. None: use the covariances of odometry.
         """
         if self._since_ns is None:
             return None
         if local_cm is not None:
-            return local_cm * math.sqrt(min(1.0, max(0, now_ns - self._since_ns) / seconds_to_ns(WINDOW_S)))
+            age = max(0, now_ns - self._since_ns) / seconds_to_ns(WINDOW_S)
+            return WALK_PER_LOCAL * local_cm * math.sqrt(age)
         return 100 * position_sigma(self.cov)
 
     @property

@@ -7,7 +7,8 @@ import pytest
 from helpers.model_edge import EMPTY, MS, UP, S
 
 from share.geometry import se3
-from share.protocol.localisation import DriftEstimator, MapFrame
+from share.metrics.local_error import LocalError
+from share.protocol.localisation import WALK_PER_LOCAL, DriftEstimator, MapFrame
 from share.types import Correction, Keyframe
 
 
@@ -170,12 +171,34 @@ def test_old_motions_are_merged_not_dropped() -> None:
     assert drift.expected_cm(None, 50 * S) == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])), rel=1e-9)
 
 
-def test_an_error_estimate_grows_as_a_random_walk_up_to_its_window() -> None:
+def test_an_error_estimate_grows_as_a_random_walk() -> None:
     drift = DriftEstimator()
     sent(drift, 11)
     drift.correct(10)  # at 1 s
-    told = [drift.expected_cm(2.0, round((1 + age) * S)) for age in (0, 0.05, 1.25, 5, 60)]
-    assert told == pytest.approx([0.0, 0.2, 1.0, 2.0, 2.0])
+    expected = [drift.expected_cm(2.0, round((1 + age) * S)) for age in (0, 0.05, 1.25, 5, 20)]
+    assert expected == pytest.approx(WALK_PER_LOCAL * np.array([0.0, 0.2, 1.0, 2.0, 4.0]))
+
+
+def test_the_drift_of_a_random_walk_follows_from_its_local_error() -> None:
+    """Walks over paths that turn, drift of 0.5 to 20 s."""
+    rng = np.random.default_rng(0)
+    stamps = np.arange(0, 40 * S, S // 20)
+    ratios = []
+    for _ in range(20):
+        turns = np.cumsum(np.cumsum(rng.normal(0, 0.02, (len(stamps), 2)), axis=0), axis=0)
+        heading = np.stack([np.cos(turns[:, 0]), np.sin(turns[:, 0]), 0.3 * np.sin(turns[:, 1])], axis=1)
+        true = np.cumsum(0.05 * heading, axis=0)
+        errors = np.cumsum(rng.normal(0, 2e-4, (len(stamps), 3)), axis=0)
+        truth, seen = (np.tile(np.eye(4), (len(stamps), 1, 1)) for _ in range(2))
+        truth[:, :3, 3], seen[:, :3, 3] = true, true + errors
+        measured = LocalError((stamps, truth))
+        local_cm = [measured.update(int(stamp), T) for stamp, T in zip(stamps, seen, strict=True)]
+        squares = [cm**2 for cm in local_cm if cm is not None]
+        for frames in (10, 40, 200, 400):
+            drift_cm = 100 * np.linalg.norm(errors[frames:] - errors[:-frames], axis=1)
+            walk = np.sqrt(np.mean(squares) * frames / 100)
+            ratios.append(np.sqrt(np.mean(drift_cm**2)) / walk)
+    assert np.median(ratios) == pytest.approx(WALK_PER_LOCAL, rel=0.1)
 
 
 def test_a_new_segment_has_no_drift() -> None:
@@ -184,4 +207,4 @@ def test_a_new_segment_has_no_drift() -> None:
     fresh = Keyframe(20, -1, 2 * S, np.eye(4), COV, np.eye(4), UP, 0.01, EMPTY)
     drift.add_keyframe(fresh, 2 * S)
     assert drift.expected_cm(None, 2 * S) == 0.0
-    assert drift.expected_cm(1.0, 3 * S) == pytest.approx(np.sqrt(0.2))
+    assert drift.expected_cm(1.0, 3 * S) == pytest.approx(WALK_PER_LOCAL * np.sqrt(0.2))
