@@ -234,8 +234,8 @@ class SelfEvaluation:
 _MAX_MOTIONS = 100  # keyframes since the last answered one; the motion of older ones is merged
 
 
-# how far a random walk ends from its start, beside its RMS about the aligned truth: sqrt(10) on a straight path,
-# sqrt(6) without rotation; of 22 agents, 0.5 to 20 s, 2.6 to 3.3 (docs/understand/scheduling.md)
+# how far a random walk ends from its start, beside its RMS about the aligned truth: sqrt(10) on a straight
+# path, sqrt(6) without rotation; of 22 agents, 0.5 to 20 s, 2.6 to 3.3 (docs/understand/scheduling.md)
 WALK_PER_LOCAL = 2.9
 
 

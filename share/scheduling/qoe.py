@@ -118,11 +118,6 @@ class QoeTable:
         """Return `qoe` of each agent (N,). error_cm NaN: unknown."""
         return self.delay_factor(delay_ms) * self.error_factor(error_cm)
 
-    def take(self, members: NDArray[np.intp]) -> QoeTable:
-        """Return the parameters of some agents, by index."""
-        beta, gamma, theta_ms = self.beta[members], self.gamma[members], self.theta_ms[members]
-        return QoeTable(self.is_ar[members], beta, gamma, theta_ms, self.lowest_penalty[members])
-
     def delay_factor(self, delay_ms: F64) -> F64:
         """Return the factor of the QoE due to delay of each agent (..., N)."""
         if self._are_all_ar:

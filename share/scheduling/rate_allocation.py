@@ -66,17 +66,18 @@ def allocate_rates(demand: AirDemand, waits_ms: Sequence[float]) -> list[F64]:
     one, unless there is none of them."""
     if not len(demand.wanted_hz):
         return [np.zeros(0) for _ in waits_ms]
-    table = _GainTable(demand)
-    shared, allocated = _Allocation.least(table), list[F64]()
+    is_ar = demand.terms.is_ar
+    groups = [np.flatnonzero(of_form) for of_form in (is_ar, ~is_ar) if of_form.any()]
+    shared, allocated = _Allocation.least(_GainTable(demand)), list[F64]()
     for wait_ms in waits_ms:
         limit = most_load(demand.median_airtime_s, wait_ms)
-        for group in table.groups:
+        for group in groups:
             if not shared.fill(group, limit, only_while_all_fit=True):
                 break
         own = shared.copy()
-        for group in table.groups:
+        for group in groups:
             own.fill(group, limit)
-        own.fill_while_worth_it(table.groups[0])
+        own.fill_while_worth_it(groups[0])
         allocated.append(own.hz)
     return allocated
 
@@ -85,8 +86,7 @@ class _GainTable:
     """QoE of N agents by number of steps above the least rate, without its factor of the delay.
 
     rates_hz (N, K): rates. worth (N, K): what one more step gains for its load, `_GIVEN` where it is not
-    wanted. error_factor (N, K): weighted. groups: agents of one form each, in the order in which they are
-    served."""
+    wanted. error_factor (N, K): weighted."""
 
     def __init__(self, demand: AirDemand) -> None:
         self.demand, self.step_load = demand, STEP_HZ * demand.airtime_s
@@ -103,8 +103,11 @@ class _GainTable:
             * np.where(steps_hz <= demand.held_hz[:, None], _HELD, 1.0),
             _GIVEN,
         )
-        is_ar = demand.terms.is_ar
-        self.groups = [_Group(self, of_form) for of_form in (is_ar, ~is_ar) if of_form.any()]
+
+    def delay_factor(self, load: float) -> F64:
+        """Return the factor of the QoE due to delay of each agent (N,), at a load of the air."""
+        demand = self.demand
+        return demand.terms.delay_factor(demand.other_delay_ms + 1e3 * demand.airtime_s / (1 - load))
 
 
 def _rates_above(least_hz: F64, wanted_hz: F64) -> F64:
@@ -114,25 +117,6 @@ def _rates_above(least_hz: F64, wanted_hz: F64) -> F64:
     steps = np.full((len(least_hz), count + 1), STEP_HZ)
     steps[:, 0] = least_hz
     return np.cumsum(steps, axis=1)
-
-
-class _Group:
-    """Agents of one form. members: their indices."""
-
-    def __init__(self, table: _GainTable, of_form: NDArray[np.bool_]) -> None:
-        demand = table.demand
-        self.members = np.flatnonzero(of_form)
-        self.step_load = table.step_load[of_form]
-        self.largest_step = float(self.step_load.max())
-        self._terms = demand.terms.take(self.members)
-        self._other_delay_ms, self._airtime_ms = (
-            demand.other_delay_ms[of_form],
-            1e3 * demand.airtime_s[of_form],
-        )
-
-    def delay_factor(self, load: float) -> F64:
-        """Return the factor of the QoE due to delay of each member, at a load of the air."""
-        return self._terms.delay_factor(self._other_delay_ms + self._airtime_ms / (1 - load))
 
 
 class _Allocation:
@@ -153,52 +137,46 @@ class _Allocation:
     def hz(self) -> F64:
         return _at(self._table.rates_hz, self._steps)
 
-    def fill(self, group: _Group, limit: float, only_while_all_fit: bool = False) -> bool:
-        """Give out steps to a group up to a load. Return whether all members have what they want."""
-        worth = _at(self._table.worth, self._steps)[group.members]
+    def fill(self, group: NDArray[np.intp], limit: float, only_while_all_fit: bool = False) -> bool:
+        """Give out steps to these agents up to a load. Return whether all have what they want."""
+        step_load, worth = self._table.step_load[group], _at(self._table.worth, self._steps)[group]
         while self._load < MAX_LOAD:
-            fits = self._load + group.largest_step <= limit
+            fits = self._load + float(step_load.max()) <= limit
             if not fits and only_while_all_fit:
                 return False
-            gains = group.delay_factor(self._load) * worth
+            gains = self._table.delay_factor(self._load)[group] * worth
             best = int(gains.argmax())
             if not fits or gains[best] <= 0:
                 is_open = worth != _GIVEN
                 if not is_open.any():
                     return True
-                is_free = is_open & (self._load + group.step_load <= limit)
+                is_free = is_open & (self._load + step_load <= limit)
                 if not is_free.any():
                     return False
                 best = int(np.where(is_free, gains, -np.inf).argmax())
-            self._give(group, best, worth)
+            worth[best] = self._give(group[best])
         return False
 
-    def fill_while_worth_it(self, group: _Group) -> None:
-        """Give out steps that gain more than the delay that they cause costs all agents."""
-        worth = _at(self._table.worth, self._steps)[group.members]
+    def fill_while_worth_it(self, group: NDArray[np.intp]) -> None:
+        """Give out steps to these agents that gain more than the delay that they cause costs all."""
+        worth = _at(self._table.worth, self._steps)[group]
         while self._load < MAX_LOAD:
-            gains = group.delay_factor(self._load) * worth
+            gains = self._table.delay_factor(self._load)[group] * worth
             best = int(gains.argmax())
             if gains[best] <= STEP_HZ * self._cost():
                 return
-            self._give(group, best, worth)
+            worth[best] = self._give(group[best])
 
-    def _give(self, group: _Group, best: int, worth: F64) -> None:
-        """Give a step to a member; `worth` is kept current."""
-        member = group.members[best]
-        self._steps[member] += 1
-        self._load = min(MAX_LOAD, self._load + float(group.step_load[best]))
-        worth[best] = self._table.worth[member, self._steps[member]]
+    def _give(self, agent: np.intp) -> float:
+        """Give a step to an agent. Return what the next one is worth."""
+        self._steps[agent] += 1
+        self._load = min(MAX_LOAD, self._load + float(self._table.step_load[agent]))
+        return float(self._table.worth[agent, self._steps[agent]])
 
     def _cost(self) -> float:
         """Return the QoE, weighted, that all agents together lose by a load of one more."""
-        error_factor = _at(self._table.error_factor, self._steps)
-        lost = (
-            error_factor[group.members]
-            @ (group.delay_factor(self._load) - group.delay_factor(self._load + _LOAD_STEP))
-            for group in self._table.groups
-        )
-        return float(sum(lost)) / _LOAD_STEP
+        now, more = (self._table.delay_factor(load) for load in (self._load, self._load + _LOAD_STEP))
+        return float(_at(self._table.error_factor, self._steps) @ (now - more)) / _LOAD_STEP
 
 
 def _at(table: F64, steps: NDArray[np.intp]) -> F64:
