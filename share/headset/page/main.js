@@ -350,3 +350,4 @@ class App {
 }
 
 export const app = new App(document.getElementById("view"));
+document.getElementById("loading").remove();  // so loading.js has nothing more to say
