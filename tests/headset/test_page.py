@@ -65,7 +65,7 @@ def test_a_part_that_does_not_come_is_said_and_loaded_again(chromium: Browser, r
     page = chromium.page(f"{room.url}page.css")
     page.call("Network.enable")
     page.call("Network.setBlockedURLs", urls=["*main.js*"])
-    said = "document.querySelector('#loading p')?.textContent ?? ''"
+    said = "(document.querySelector('#loading p')?.textContent ?? '')"
     page.open(room.url)
     page.wait_for(f"{said}.startsWith('A part of this page did not come') && {said}.includes('again in 9 s')")
     assert page.evaluate("sessionStorage.getItem('share-loads')") == "3"  # it has loaded itself twice
