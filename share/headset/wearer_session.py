@@ -27,8 +27,8 @@ class SessionOverError(PairingError):
 
 
 class SessionMoment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A moment by two clocks. boot: tells one running of the machine from another. up_s: since its start,
-    sleep included. wall_s: of the wall clock, which may be set meanwhile."""
+    """A moment by two clocks. boot: tells one running of the machine from another; empty: not known. up_s:
+    since its start, sleep included. wall_s: of the wall clock, which may be set meanwhile."""
 
     boot: str
     up_s: float
@@ -38,7 +38,7 @@ class SessionMoment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return SessionMoment(self.boot, self.up_s + seconds, self.wall_s + seconds)
 
     def seconds_to(self, later: SessionMoment) -> float:
-        if self.boot == later.boot:
+        if self.boot and self.boot == later.boot:
             return later.up_s - self.up_s
         return later.wall_s - self.wall_s
 

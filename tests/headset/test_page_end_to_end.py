@@ -28,7 +28,7 @@ from share.sensors.profile import shipped_profiles
 
 pytestmark = pytest.mark.slow
 
-SECONDS = 90.0
+SECONDS = 60.0
 CUBE_STAYS_M = 0.1
 
 

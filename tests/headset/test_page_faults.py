@@ -151,6 +151,24 @@ def test_the_clock_of_a_device_is_set_by_ten_seconds(ann: BrowserPage, served: S
     assert not ann.app("app.placement.isContradicted")
 
 
+def test_the_clock_of_the_headset_is_put_back_by_ten_seconds(
+    ann: BrowserPage, served: ServedRoom, network: DelayedPort
+) -> None:
+    """Between two loads of its page, whose numbers of requests begin with the clock."""
+    ann.call(
+        "Page.addScriptToEvaluateOnNewDocument",
+        source="((now) => (Date.now = () => now() - 10000))(Date.now)",
+    )
+    worn.open_again(ann, f"http://127.0.0.1:{network.port}/")
+    worn.walk_aligned(ann)
+    ann.evaluate(worn.WATCH)
+    put(ann, 8)
+    ann.wait("!app.connection.isPending(8)")
+    assert objects_of(served) == {CUBE, 8}
+    worn.wait_frames(ann, 30)
+    assert_it_stays(ann)
+
+
 def test_the_device_of_a_wearer_is_lost(ann: BrowserPage, served: ServedRoom) -> None:
     served.states["ann"] = TrackState.LOST
     worn.wait_until_said(ann, "ann LOST")

@@ -52,6 +52,10 @@ def test_a_clock_that_is_set_changes_nothing_while_the_machine_runs(step_s: floa
 
 def test_after_a_start_of_the_machine_the_wall_clock_tells() -> None:
     secret = seal(KEY, session())
+    unknown = WearerSession("ann", None, EDGE, 7, SessionMoment("", 9.0, NOW.wall_s + 10), "n")
+    assert unknown.is_over(SessionMoment("", 5.0, NOW.wall_s + 20)), (
+        "a sandbox does not say which start it is"
+    )
     for later_s in (60, SESSION_S - 1):
         assert unseal(KEY, secret, EDGE, SessionMoment("another", 5.0, NOW.wall_s + later_s))
     for later_s in (SESSION_S, 1e9, -1, -1e9):
