@@ -119,6 +119,15 @@ def place_of(page: BrowserPage, kind: str) -> Any:
     )
 
 
+def aim_beside(page: BrowserPage) -> None:
+    """Let the hand point at the floor to the right of the wearer, where the panel is not."""
+    x, y, z, right_x, right_z = page.app("((T) => [T[12], T[13], T[14], T[0], T[2]])(app.viewerPose)")
+    at = [x + 1.2 * right_x, 0, z + 1.2 * right_z]
+    hand = [x + 0.4 * right_x, y - 0.3, z + 0.4 * right_z]
+    page.evaluate(f"(aims = {{ at: {at}, from: {hand} }}, 0)")
+    worn.wait_frames(page, 2)
+
+
 def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Site, session: Path) -> None:
     used = site.code()
     ann = worn.wear(chromium, site.url, "ann", used, (320, 160))
@@ -135,14 +144,18 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
         site.skip_if_late()
     assert ann.app(in_one_map)
 
+    aim_beside(ann)
     worn.place(ann, "cube")
     worn.press(ann, False)
     ben.wait("app.room.objects.size === 1")
     worn.place(ann, "marker")
     placed = place_of(ben, "marker") or soon(lambda: place_of(ben, "marker"))
-    aims = "(drags = (ms) => { aims = { ...aims, at: [0.6 - ((ms / 2000) % 1), 0, -1.4] }; }, 0)"
-    ann.evaluate(aims)
-    time.sleep(1.5)
+    ann.evaluate(
+        "(first = aims.at, beganMs = null, drags = (ms) => {"
+        " beganMs ??= ms; const s = Math.min(ms - beganMs, 1500) / 3000;"
+        " aims = { ...aims, at: [first[0] + s, 0, first[2] + s] }; }, 0)"
+    )
+    time.sleep(2.0)
     ann.evaluate("(drags = null, 0)")
     worn.press(ann, False)
     ann.wait("[...app.room.objects.values()].every((one) => !one.isHeld)")
@@ -152,7 +165,7 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
     assert np.linalg.norm(np.subtract(dragged[3:], placed[3:])) > 0.1
     ann.evaluate(worn.WATCH)
     worn.wait_frames(ann, 30)
-    worn.push(ann, "mode")
+    ann.app("(app.placement.setMode('follow'), 0)")
     ann.wait("app.placement.isFollowing")
 
     site.edge.kill()
@@ -176,8 +189,8 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
         for kind, before in (("cube", cube), ("marker", dragged)):
             now = place_of(page, kind)
             assert now[:3] == before[:3] and np.allclose(now[3:], before[3:], atol=1e-3)
-    worn.push(ann, "mode")
-    ann.wait("!app.placement.isFollowing && app.placement.mode === 'align'")
+    ann.app("(app.placement.setMode('align'), 0)")
+    ann.wait("!app.placement.isFollowing")
     time.sleep(1.0)
     ann.evaluate("(watched = {}, 0)")
     worn.wait_frames(ann, 60)
