@@ -28,7 +28,7 @@ from share.sensors.profile import shipped_profiles
 
 pytestmark = pytest.mark.slow
 
-SECONDS = 60.0
+SECONDS = 100.0
 CUBE_STAYS_M = 0.1
 
 
@@ -136,13 +136,12 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
     ben.wait("app.connection.isConnected", 60)
     for name in ("ann", "ben"):
         site.start_agent(name)
-    ann.wait("app.room.agents.get('ann')?.isPosed && app.room.agents.get('ben')?.isPosed", 60)
+    maps = "['ann', 'ben'].map((name) => app.room.agents.get(name)?.mapId ?? null)"
+    if not soon(lambda: ann.app(f"(([a, b]) => a !== null && a === b)({maps})"), 45.0):
+        site.skip_if_late()
     RecordedWalk(session / "truth" / "ann.tum", worn.T_body_viewer).wear(ann, "ann")
     ann.app("(app.placement.reset(), 0)")  # what was seen before the headset moved along
-    in_one_map = "app.place.mapId !== null && app.room.agents.get('ben').mapId === app.place.mapId"
-    if not soon(lambda: ann.app(in_one_map), 30.0):
-        site.skip_if_late()
-    assert ann.app(in_one_map)
+    ann.wait("app.place.mapId !== null && app.room.agents.get('ben').mapId === app.place.mapId", 30)
 
     aim_beside(ann)
     worn.place(ann, "cube")
@@ -167,6 +166,7 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
     worn.wait_frames(ann, 30)
     ann.app("(app.placement.setMode('follow'), 0)")
     ann.wait("app.placement.isFollowing")
+    worn.wait_until_said(ann, "follow ±")  # by a module that nobody serves in a moment
 
     site.edge.kill()
     worn.wait_until_said(ann, "trying again")

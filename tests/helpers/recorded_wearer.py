@@ -57,12 +57,15 @@ class RecordedWalk:
 
     def began_ms(self, page: BrowserPage, agent: str, seconds: float = 4.0) -> float:
         """Return when the first frame arrived at the agent, ms of the server's clock."""
-        seen: dict[float, list[float]] = {}
-        own = f"((one) => one?.isPosed ? [one.stampMs, [...one.T]] : null)(app.room.agents.get({agent!r}))"
+        seen, last_map = dict[float, list[float]](), ""
+        own = "((one) => one?.isPosed ? [one.mapId, one.stampMs, [...one.T]] : null)"
         began_s = time.monotonic()
         while time.monotonic() < began_s + seconds or len(seen) < 20:
-            if (found := page.app(own)) is not None:
-                seen[found[0]] = found[1]
+            if (found := page.app(f"{own}(app.room.agents.get({agent!r}))")) is not None:
+                map_id, stamp_ms, T = found
+                if map_id != last_map:  # joined, or the first one
+                    seen, last_map = {}, map_id
+                seen[stamp_ms] = T
             assert time.monotonic() < began_s + seconds + 60, f"{len(seen)} poses of '{agent}'"
         stamps_s = np.array(list(seen)) / 1e3
         T_map_body = np.array([np.reshape(T, (4, 4), order="F") for T in seen.values()])
