@@ -166,7 +166,7 @@ def test_two_wearers_go_on_while_the_edge_is_killed(chromium: Browser, site: Sit
     worn.wait_frames(ann, 30)
     ann.app("(app.placement.setMode('follow'), 0)")
     ann.wait("app.placement.isFollowing")
-    worn.wait_until_said(ann, "follow ±")  # by a module that nobody serves in a moment
+    worn.wait_until_said(ann, "follow ±")
 
     site.edge.kill()
     worn.wait_until_said(ann, "trying again")

@@ -65,6 +65,11 @@ class App {
         return this.session !== null;
     }
 
+    // What is the case, line by line: [text, colour].
+    get lines() {
+        return stateLines(this);
+    }
+
     // T_local_viewer of the present frame.
     get viewerPose() {
         return this.#T_local_viewer;
@@ -276,7 +281,7 @@ class App {
         this.#setPlace();
         panel.place(this.#T_local_viewer);
         this.#updatePointers(frame, beganMs);
-        panel.draw(place.T_map_local, () => stateLines(this), beganMs);
+        panel.draw(place.T_map_local, () => this.lines, beganMs);
         this.scene.update(place.mapId, displayMs, this.connection.clock);
         transformPoint(this.#eye, place.T_map_local, this.#T_local_viewer.subarray(12, 15));
         this.#fillFrame(this.#eye, this.#shownPointers);
