@@ -33,9 +33,10 @@ CUBE_STAYS_M = 0.1
 
 
 @pytest.fixture(scope="module")
-def session(request: pytest.FixtureRequest) -> Path:
-    """Two people who walk about in one room, 320 x 240 at 15 Hz; made once."""
-    cache = Path(request.config.cache.mkdir("headset-session"))  # type: ignore[union-attr]
+def session(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two people who walk about in one room, 320 x 240 at 15 Hz; made once, in two minutes."""
+    kept = getattr(request.config, "cache", None)  # none with -p no:cacheprovider
+    cache = Path(tmp_path_factory.mktemp("cache") if kept is None else kept.mkdir("headset-session"))
     profile = yaml.safe_load(shipped_profiles()["d435i"].read_text())
     lens = {"intrinsics": [192.5, 192.5, 159.95, 119.55]}
     mode = {"width": 320, "height": 240, "rates_hz": [15], "cam0": lens, "cam1": lens}
