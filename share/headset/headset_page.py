@@ -95,7 +95,7 @@ class HeadsetPage(ServedPage):
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
         table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
-        SessionLedger(default_folder())  # a damaged one is said before the page is served
+        SessionLedger("", default_folder())  # a damaged one is said before the page is served
         listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
@@ -108,6 +108,7 @@ class HeadsetPage(ServedPage):
         settings = HeadsetSettings(
             access,
             where.host,
+            self.endpoint,
             self.certificate,
             session_key(default_folder()),
             default_folder(),

@@ -35,7 +35,7 @@ _Time = Annotated[float, Meta(ge=-1e15, le=1e15)]
 _Millis = Annotated[float, Meta(ge=0, le=1e7)]
 _Id = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 _Text = Annotated[str, Meta(max_length=200)]
-_Secret = Annotated[str, Meta(max_length=1024)]
+_Secret = Annotated[str, Meta(max_length=2048)]
 _Three = tuple[_Number, _Number, _Number]
 _Four = tuple[_Number, _Number, _Number, _Number]
 MessageError = msgspec.DecodeError

@@ -16,8 +16,10 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from share.files.reading import MB, read_bytes
+from share.headset.page_joining import inline_sources, joined_html, joined_module
 
 FOLDER = Path(__file__).with_name("page")
+MODULE = "main.js"
 ROOM_PATH = "/room"
 _MAX_FILE_BYTES = 2 * MB
 _NAME = re.compile(r"[a-z\d][a-z\d_-]{0,60}\.[a-z\d]{2,6}")
@@ -45,13 +47,20 @@ def _line(status: HTTPStatus, text: str) -> PageAnswer:
 
 
 def read_page(folder: Path = FOLDER) -> dict[str, PageAnswer]:
-    """Return the files of the page, by path. Raises OSError."""
+    """Return the files of the page, by path; its HTML and its module joined (`page_joining`). Raises OSError,
+    ValueError."""
     files = {
-        f"/{one.name}": PageAnswer(HTTPStatus.OK, _TYPES[one.suffix[1:]], read_bytes(one, _MAX_FILE_BYTES))
+        one.name: read_bytes(one, _MAX_FILE_BYTES)
         for one in sorted(folder.iterdir() if folder.is_dir() else ())
         if _NAME.fullmatch(one.name) and one.suffix[1:] in _TYPES and one.is_file() and not one.is_symlink()
     }
-    return files | ({"/": files["/index.html"]} if "/index.html" in files else {})
+    texts = {name: data.decode() for name, data in files.items() if name.endswith((".html", ".css", ".js"))}
+    if MODULE in files:
+        files[MODULE] = joined_module(MODULE, texts).encode()
+    if "index.html" in files:
+        files[""] = files["index.html"] = joined_html(texts["index.html"], texts).encode()
+    kind_of = {name: _TYPES[name.rpartition(".")[2] or "html"] for name in files}
+    return {f"/{name}": PageAnswer(HTTPStatus.OK, kind_of[name], data) for name, data in files.items()}
 
 
 def own_names(host: str, further: Collection[str] = ()) -> frozenset[str]:
@@ -66,6 +75,10 @@ class PageGuard:
 
     def __init__(self, scheme: str, names: Collection[str], files: Mapping[str, PageAnswer]) -> None:
         self._scheme, self._names, self._files = scheme, frozenset(names), files
+        html = files["/"].body if "/" in files else b""
+        self._scripts, self._styles = (
+            " ".join(["'self'", *inline_sources(html, kind)]) for kind in ("script", "style")
+        )
 
     def answer(self, target: str, headers: Mapping[str, str], is_upgrade: bool) -> PageAnswer | None:
         """Return the answer to a request; None: it may become a WebSocket. headers: by name in lower case."""
@@ -98,8 +111,8 @@ class PageGuard:
         socket_origin = f"{'wss' if self._scheme == 'https' else 'ws'}://{host}" if self._is_own(host) else ""
         policy = [
             "default-src 'none'",
-            "script-src 'self'",
-            "style-src 'self'",
+            f"script-src {self._scripts}",
+            f"style-src {self._styles}",
             "img-src 'self' data:",
             f"connect-src 'self' {socket_origin}".rstrip(),
             *("base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'"),

@@ -29,9 +29,10 @@ from share.headset.measures import MeasureTable, ServerReport, encode_report, me
 from share.headset.mounts import ViewerMount
 from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
 from share.headset.page_sending import CLOSE_S, end_page, has_left, refuse, send_all
-from share.headset.pairing import PairingError, SessionOverError
+from share.headset.pairing import PairingError
 from share.headset.session_ledger import SessionLedger
 from share.headset.shared_room import SharedRoom
+from share.headset.wearer_session import SessionOverError
 from share.headset.wearers import EdgeAccess, ListDamagedError, PageSeat, Wearer, WearerRegistry
 from share.net.bounded_websocket import (
     BoundedListener,
@@ -59,12 +60,13 @@ _MAX_MOVES = 32  # of maps, that a page was told
 @dataclass(frozen=True)
 class HeadsetSettings:
     """What the server is started with. certificate: None: plain HTTP, of this machine alone. host: that it
-    listens on. session_key: that signs sessions. sessions: the folder that says which ones
-    are the newest. began_s: when the page began, monotonic. table: where what
-    pages measure is written. folder: with the page's files."""
+    listens on. endpoint: the address and port to which sessions are bound. session_key: that signs them.
+    sessions: the folder that says which ones are the newest. began_s: when the page began, monotonic. table:
+    where what pages measure is written. folder: with the page's files."""
 
     access: EdgeAccess
     host: str
+    endpoint: str
     certificate: PageCertificate | None
     session_key: bytes = field(repr=False)
     sessions: Path
@@ -89,7 +91,7 @@ class HeadsetServer:
         self._wearers = WearerRegistry(
             settings.access,
             settings.session_key,
-            SessionLedger(settings.sessions),
+            SessionLedger(settings.endpoint, settings.sessions),
             self._notify,
             self._dismiss,
         )

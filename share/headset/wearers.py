@@ -22,9 +22,16 @@ from share.headset.page_messages import (
     PageMeasured,
     PageRequest,
 )
-from share.headset.pairing import PairingDesk, PairingError, SessionOverError, WearerSession, seal, unseal
-from share.headset.session_ledger import SessionLedger
+from share.headset.pairing import PairingDesk, PairingError
+from share.headset.session_ledger import SessionLedger, moment_now
 from share.headset.wearer_link import Tell, WearerLink, refusal_of
+from share.headset.wearer_session import (
+    SessionOverError,
+    WearerSession,
+    check_end,
+    seal,
+    unseal,
+)
 from share.net.keys import AgentKeys, AllowList, allow_list
 from share.net.lent_keys import LentKeys
 from share.timing import TokenBucket, TokenBuckets
@@ -249,7 +256,7 @@ class WearerRegistry:
     def let_in(self, hello: PageHello, address: str) -> tuple[Wearer, str, frozenset[Permission]]:
         """Return the wearer of a hello, its session's secret and its rights. Raises PairingError."""
         if hello.session is not None:
-            session = unseal(self._key, hello.session, time.time())
+            session = unseal(self._key, hello.session, self._ledger.edge, moment_now())
             if not self._ledger.is_newest(session):
                 raise _replaced(session.name)
             rights = self._access.rights_of(session.name)
@@ -280,14 +287,13 @@ class WearerRegistry:
         if wearer is None and len(self._wearers) >= MAX_WEARERS:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
         self.desk.renew()
-        end_s = self._ledger.end_of_new(name, time.time())
-        return WearerSession(name, agent, end_s, secrets.token_urlsafe(12)), rights
+        return self._ledger.new_session(name, agent, moment_now()), rights
 
     def _add(self, session: WearerSession) -> Wearer:
         if len(self._wearers) >= MAX_WEARERS:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
         try:
-            self._ledger.note(session, time.time())
+            self._ledger.note(session)
         except (ShareError, OSError) as error:
             self._notify(
                 f"headset page: {error}: after a start of the edge, sessions that are over may be good again"
@@ -315,8 +321,7 @@ class WearerRegistry:
     def rights_now(self, wearer: Wearer) -> frozenset[Permission]:
         """Return what a wearer may do by now. Raises PairingError if it may be here no more, ListDamagedError
         where that is not known."""
-        if time.time() >= wearer.session.end_s:
-            raise SessionOverError("this session is over; pair again with the code of the edge")
+        check_end(wearer.session, moment_now())
         return self._access.rights_of(wearer.name)
 
     def close(self) -> None:

@@ -61,9 +61,10 @@ def edge() -> Iterator[RoomServer]:
         yield server
 
 
-def serve(site: Path, address: str, **options: Any) -> HeadsetPage:
-    access = EdgeAccess(address, ALL)
-    return HeadsetPage("http://127.0.0.1:0", options.pop("access", access), folder=site, **options)
+def serve(site: Path, address: str, endpoint: str = "127.0.0.1:0", **options: Any) -> HeadsetPage:
+    """endpoint: of a page that has ended, which sessions are bound to."""
+    access = options.pop("access", EdgeAccess(address, ALL))
+    return HeadsetPage(f"http://{endpoint}", access, folder=site, **options)
 
 
 @pytest.fixture(scope="module")
@@ -515,19 +516,19 @@ def test_a_server_that_is_killed_comes_back_and_knows_its_wearers(
     assert "headset page: 'ann' has paired, with the device of 'ann'" in told
 
 
-def paired_twice(site: Path, edge: RoomServer) -> tuple[str, str]:
-    """Return ann's older and newer session of a server that has ended."""
+def paired_twice(site: Path, edge: RoomServer) -> tuple[str, str, str]:
+    """Return the address of a server that has ended, and ann's older and newer session there."""
     with closing(serve(site, edge.address)) as page:
         with paired(page, "ann") as first:
             old = first.seen[0]["session"]
         assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": False})["is_connected"])
         with paired(page, "ann") as second:
-            return old, second.seen[0]["session"]
+            return page.endpoint, old, second.seen[0]["session"]
 
 
 def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomServer) -> None:
-    old, new = paired_twice(site, edge)
-    with closing(serve(site, edge.address)) as page:
+    endpoint, old, new = paired_twice(site, edge)
+    with closing(serve(site, edge.address, endpoint)) as page:
         code(page)
         for session, answer in ((old, "refused"), (new, "welcome"), (old, "refused")):
             with PageClient(page.endpoint) as one:
@@ -536,12 +537,30 @@ def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomSer
                 assert answer == "welcome" or (said["is_over"] and "another headset" in said["reason"])
 
 
+def test_two_edges_of_a_machine_have_sessions_of_their_own(site: Path, edge: RoomServer) -> None:
+    with closing(serve(site, edge.address)) as one, closing(serve(site, edge.address)) as other:
+        sessions = []
+        for page in (one, other):
+            with paired(page, "ann" if page is one else "bob") as ann:
+                sessions.append(ann.seen[0]["session"])
+        for page, session, answer in (
+            (one, sessions[0], "welcome"),
+            (other, sessions[0], "refused"),
+            (other, sessions[1], "welcome"),
+            (one, sessions[1], "refused"),
+        ):
+            with PageClient(page.endpoint) as again:
+                said = again.hello(session=session)
+                assert said["type"] == answer
+                assert answer == "welcome" or (said["is_over"] and "not known here" in said["reason"])
+
+
 def test_a_page_whose_place_a_newer_session_takes_is_told(site: Path, edge: RoomServer) -> None:
     """What the server knew of sessions is lost, so the older page was let in; its STOP reached nobody."""
-    old, new = paired_twice(site, edge)
+    endpoint, old, new = paired_twice(site, edge)
     for file in default_folder().glob(LEDGER_FILE):
         file.unlink()
-    with closing(serve(site, edge.address)) as page, PageClient(page.endpoint) as older:
+    with closing(serve(site, edge.address, endpoint)) as page, PageClient(page.endpoint) as older:
         assert older.hello(session=old)["type"] == "welcome"
         with PageClient(page.endpoint) as newer:
             assert newer.hello(session=new)["type"] == "welcome"

@@ -61,6 +61,40 @@ def test_flat_pages_share_what_a_mouse_places(chromium: Browser, room: HeadsetRo
     assert ann.problems == ben.problems == []
 
 
+def test_a_part_that_does_not_come_is_said_and_loaded_again(chromium: Browser, room: HeadsetRoom) -> None:
+    page = chromium.page(f"{room.url}page.css")
+    page.call("Network.enable")
+    page.call("Network.setBlockedURLs", urls=["*main.js*"])
+    said = "(document.querySelector('#loading p')?.textContent ?? '')"
+    page.open(room.url)
+    page.wait_for(f"{said}.startsWith('A part of this page did not come') && {said}.includes('again in 9 s')")
+    assert page.evaluate("sessionStorage.getItem('share-loads')") == "3"  # it has loaded itself twice
+    page.call("Network.setBlockedURLs", urls=[])
+    page.wait_for("document.getElementById('loading') === null")  # and once more
+    page.wait_for(
+        "!document.getElementById('start').hidden && sessionStorage.getItem('share-loads') === null"
+    )
+    page.call("Network.setBlockedURLs", urls=["*main.js*"])
+    page.evaluate("sessionStorage.setItem('share-loads', 3)")
+    page.open(room.url)
+    page.wait_for(f"{said}.startsWith('A part of this page did not come') && !{said}.includes('again in')")
+    page.call("Network.setBlockedURLs", urls=[])
+    page.click("#loading a")  # nobody has to wait
+    page.wait_for("!document.getElementById('start').hidden")
+
+
+def test_a_browser_that_cannot_show_it_is_told_why(chromium: Browser, room: HeadsetRoom) -> None:
+    page = chromium.page(f"{room.url}page.css")
+    page.call(
+        "Page.addScriptToEvaluateOnNewDocument", source="delete HTMLCanvasElement.prototype.getContext;"
+    )
+    page.open(room.url)
+    page.wait_for(
+        "document.querySelector('#loading p').textContent.startsWith('This page cannot run here: ')"
+    )
+    assert page.evaluate("sessionStorage.getItem('share-loads')") == "0"  # it is not loaded again and again
+
+
 def test_what_is_refused_goes_back_and_is_said(chromium: Browser, room: HeadsetRoom) -> None:
     page = chromium.page(room.url)
     worn.pair(page, "ann")

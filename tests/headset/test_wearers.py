@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from share.headset.pairing import PairingError, SessionOverError, WearerSession
-from share.headset.session_ledger import SessionLedger
+from share.headset.pairing import PairingError
+from share.headset.session_ledger import SessionLedger, moment_now
+from share.headset.wearer_session import SessionOverError, WearerSession
 from share.headset.wearers import EdgeAccess, ListDamagedError, WearerRegistry
 from share.net.keys import authorize, generate_pair, revoke
 from share.wire.room_messages import Permission
 
 
 def wearer(name: str, left_s: float) -> Any:
-    return SimpleNamespace(name=name, session=WearerSession(name, None, time.time() + left_s, "n"))
+    session = WearerSession(name, None, "a:1", 1, moment_now().after(left_s), "n")
+    return SimpleNamespace(name=name, session=session)
 
 
 def registry(access: EdgeAccess) -> WearerRegistry:
-    return WearerRegistry(access, bytes(32), SessionLedger(), lambda line: None, lambda *_: None)
+    return WearerRegistry(access, bytes(32), SessionLedger("a:1"), lambda line: None, lambda *_: None)
 
 
 def test_twelve_hours_end_also_for_a_page_that_stays() -> None:

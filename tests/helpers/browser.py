@@ -104,6 +104,15 @@ class BrowserPage:
             time.sleep(0.03)
         return value
 
+    def wait_for(self, expression: str, seconds: float = 60.0) -> None:
+        """Wait until an expression is true in a page whose module may not be there, and which may load."""
+        end, found = time.monotonic() + seconds, None
+        while found is not True:
+            assert time.monotonic() < end, f"{expression}: {found}; {self.problems}"
+            with suppress(BrowserError, AssertionError):
+                found = self.evaluate(expression)
+            time.sleep(0.03)
+
     def open(self, url: str) -> None:
         self.call("Page.navigate", url=url)
         end = time.monotonic() + _CALL_S

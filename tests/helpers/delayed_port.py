@@ -22,12 +22,22 @@ class DelayedPort:
     def __init__(self, target: tuple[str, int], network: NetworkModel, seed: int) -> None:
         self._target, self._network = target, network
         self._seeds, self._open, self._is_gone = np.random.default_rng(seed), list[socket.socket](), False
+        self._is_clear = threading.Event()
+        self._is_clear.set()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
+        self._is_clear.set()
         self._listener.close()
+
+    def hold(self, is_silent: bool) -> None:
+        """Let nothing through and end nothing, as where a Wi-Fi is out of reach; or let come what waited."""
+        if is_silent:
+            self._is_clear.clear()
+        else:
+            self._is_clear.set()
 
     def cut(self, is_gone: bool) -> None:
         """End all connections and let no other in, or be there again."""
@@ -68,6 +78,7 @@ class DelayedPort:
                 while True:
                     arrival_ns, data = waiting.get()
                     time.sleep(max(0, arrival_ns - time.monotonic_ns()) * 1e-9)
+                    self._is_clear.wait()
                     if not data:
                         break
                     sink.sendall(data)

@@ -128,10 +128,9 @@ def walk_aligned(page: BrowserPage) -> None:
 
 def wait_until_said(page: BrowserPage, text: str, seconds: float = 60.0) -> None:
     """Wait until the panel says so."""
-    said = "import('/hud.js').then(({ stateLines }) => import('/main.js').then(({ app }) => stateLines(app)))"
     end = time.monotonic() + seconds
     while True:
-        lines = [line for line, _ in page.evaluate(said)]
+        lines = [line for line, _ in page.app("app.lines")]
         if any(text in line for line in lines):
             return
         assert time.monotonic() < end, lines

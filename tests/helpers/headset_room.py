@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-import mimetypes
 import threading
 import time
 from collections.abc import Callable
@@ -20,13 +19,12 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
 from share.geometry import se3
+from share.headset.page_requests import PageGuard, own_names, read_page
 from share.types import F64
 
 PAGE = Path(__file__).resolve().parents[2] / "share" / "headset" / "page"
 CODE = "48392175"
 MAP = "ann-1/0"
-_OWN = "script-src 'self'; style-src 'self'; connect-src 'self'"
-_POLICY = f"default-src 'none'; {_OWN}; base-uri 'none'; form-action 'none'"
 Pose = tuple[F64, F64, F64]  # T_map_body, velocity in the map, angular velocity in the body
 
 
@@ -41,6 +39,7 @@ class HeadsetRoom:
         self.mount: F64 | None = None
         self.may = {"objects": True, "commands": True}
         self.paths: dict[str, list[list[float]]] = {}
+        self._guard = PageGuard("http", own_names("127.0.0.1"), read_page(PAGE))
         self._seats = dict[str, ServerConnection]()
         self._names = dict[str, tuple[str, str | None]]()
         self._lock, self._ended = threading.RLock(), threading.Event()
@@ -96,16 +95,13 @@ class HeadsetRoom:
         return [one for one in self.received if one["type"] == kind]
 
     def _answer(self, _: ServerConnection, request: Request) -> Response | None:
-        path = request.path.partition("?")[0]
-        if path == "/room":
+        headers = {name.lower(): value for name, value in request.headers.raw_items()}
+        answer = self._guard.answer(request.path, headers, "upgrade" in headers)
+        if answer is None:
             return None
-        file = PAGE / ("index.html" if path == "/" else path[1:])
-        if not (file.parent == PAGE and file.is_file()):
-            return Response(404, "Not Found", Headers(), b"")
-        kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
-        body = file.read_bytes()
-        fields = {"Content-Type": kind, "Content-Length": str(len(body)), "Content-Security-Policy": _POLICY}
-        return Response(200, "OK", Headers(fields | {"Cache-Control": "no-store"}), body)
+        fields = self._guard.headers(headers["host"])
+        fields |= {"Content-Type": answer.media_type, "Content-Length": str(len(answer.body))}
+        return Response(int(answer.status), "", Headers(fields), answer.body)
 
     def _serve(self, connection: ServerConnection) -> None:
         hello = json.loads(connection.recv())

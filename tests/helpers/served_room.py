@@ -84,10 +84,12 @@ def _moving(room: ServedRoom, names: Sequence[str]) -> Iterator[None]:
         feed.add_event(ev.RunArrived(f"{name}-1", name, AgentKind.AR, np.eye(4), (0.8, 0.6)))
         feed.add_event(ev.CorrectionArrived(f"{name}-1", MAP, np.eye(4), 0))
 
+    to_wall_s = time.time() - time.monotonic()
+
     def move() -> None:
         while not ended.wait(1 / 30):
-            now_ns = time.monotonic_ns()
-            T, _, _ = room.walk(time.time() - AGE_S)
+            now_ns = time.monotonic_ns()  # alone says where the device is: a busy machine may stop here
+            T, _, _ = room.walk(to_wall_s + 1e-9 * now_ns - AGE_S)
             stamp_ns = now_ns + round((room.clock_error_s - AGE_S) * 1e9)
             for name in names:
                 state = room.states.get(name, TrackState.OK)

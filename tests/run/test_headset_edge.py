@@ -107,7 +107,7 @@ def test_wearers_see_agents_that_track_in_their_map(tmp_path: Path, plain_sessio
         client.keep_alive()
         return client, welcome
 
-    edge.wait_for("the code for the next wearer")
+    edge.wait_for("the code for the next wearer", WAIT_S)
     ann, welcome = wearer("ann")
     assert welcome["T_body_viewer"] == [x for row in T for x in row] and welcome["mount_timeshift_ms"] == 2.0
     bob, welcome = wearer("bob")

@@ -65,6 +65,11 @@ class App {
         return this.session !== null;
     }
 
+    // What is the case, line by line: [text, colour].
+    get lines() {
+        return stateLines(this);
+    }
+
     // T_local_viewer of the present frame.
     get viewerPose() {
         return this.#T_local_viewer;
@@ -207,6 +212,7 @@ class App {
         this.frames++;
         const nowMs = performance.now();
         this.script.add(nowMs - beganMs);
+        if (this.isInHeadset && this.placement.isHeld) return;  // no pose was drawn by
         const poseMs = own?.isPosed ? this.connection.clock.toPage(own.stampMs) : null;
         const ageMs = Math.max(nowMs, displayMs) - poseMs;
         if (poseMs !== null && ageMs < MAX_AGE_MS) this.latency.add(Math.max(ageMs, 0));  // clocks may err by a little
@@ -275,7 +281,7 @@ class App {
         this.#setPlace();
         panel.place(this.#T_local_viewer);
         this.#updatePointers(frame, beganMs);
-        panel.draw(place.T_map_local, () => stateLines(this), beganMs);
+        panel.draw(place.T_map_local, () => this.lines, beganMs);
         this.scene.update(place.mapId, displayMs, this.connection.clock);
         transformPoint(this.#eye, place.T_map_local, this.#T_local_viewer.subarray(12, 15));
         this.#fillFrame(this.#eye, this.#shownPointers);
@@ -350,3 +356,4 @@ class App {
 }
 
 export const app = new App(document.getElementById("view"));
+document.getElementById("loading").remove();  // so loading.js has nothing more to say

@@ -1,7 +1,8 @@
 // Where the room is, seen from the headset: T_map_local of each frame, in one of two modes.
 //   align   the headset tracks itself; SHARE says, filtered, where its space is in the map
-//   follow  the wearer is where SHARE's newest pose says, predicted to the time of display: its latency is seen
-// Where it jumps (maps joined, the space aligned anew, another mode) what is drawn eases over EASE_MS.
+//   follow  the wearer is where SHARE's newest pose says, predicted to the time of display: its latency is seen; where
+//           no pose comes, what is drawn is held by the headset's own tracking
+// Where it jumps (maps joined, the space aligned anew, the other way to draw) what is drawn eases over EASE_MS.
 import { PairOutcome, SpaceAlignment } from "./alignment.js";
 import { T_body_viewer_nominal } from "./conventions.js";
 import { exp, identity, inverse, log, multiply } from "./math.js";
@@ -24,7 +25,8 @@ export function easeLeft(sinceMs) {
 }
 
 export class Placement {
-    mode = "align";
+    mode = "align";  // as the wearer wants it
+    isFollowing = false;  // as it is drawn
     isPredicting = true;  // in follow
     mapId = null;  // of what is drawn; null: the headset's place is not known
     T_map_local = identity();  // as drawn
@@ -57,9 +59,12 @@ export class Placement {
     }
 
     setMode(mode) {
-        if (mode === this.mode) return;
         this.mode = mode;
-        this.#hasJumped = mode === "align" ? "drawn by the headset's tracking" : "drawn by SHARE's newest pose";
+    }
+
+    // Whether the wearer wants to follow poses of which no new one comes.
+    get isHeld() {
+        return this.mode === "follow" && !this.isFollowing;
     }
 
     // A pose of the own device; timeMs: of its stamp on the page's clock.
@@ -99,7 +104,8 @@ export class Placement {
     update(timeMs, T_local_viewer) {
         this.history.add(timeMs, T_local_viewer);
         this.#pairWaiting();
-        const mapId = this.mode === "align" ? this.#align() : this.#follow(timeMs, T_local_viewer);
+        this.#chooseWay(timeMs);
+        const mapId = this.isFollowing ? this.#follow(timeMs, T_local_viewer) : this.#align();
         if (mapId === null) {
             this.mapId = null;
             return;
@@ -151,9 +157,17 @@ export class Placement {
             if (this.#refused.length > JUDGED) this.#refused.shift();
             if (outcome === PairOutcome.RESTARTED || outcome === PairOutcome.STARTED) {
                 this.#earlier = [];
-                if (this.mode === "align") this.#hasJumped = "the headset's space was aligned anew";
+                if (!this.isFollowing) this.#hasJumped = "the headset's space was aligned anew";
             }
         }
+    }
+
+    #chooseWay(timeMs) {
+        const isFollowing = this.mode === "follow" && this.#pose !== null && timeMs - this.#pose.timeMs <= MAX_AGE_MS;
+        if (isFollowing === this.isFollowing) return;
+        this.isFollowing = isFollowing;
+        if (isFollowing) this.#hasJumped = "drawn by SHARE's newest pose";
+        else this.#hasJumped = `${this.isHeld ? "no new pose: " : ""}drawn by the headset's tracking`;
     }
 
     #align() {
@@ -164,7 +178,6 @@ export class Placement {
 
     #follow(timeMs, T_local_viewer) {
         const pose = this.#pose;
-        if (pose === null || timeMs - pose.timeMs > MAX_AGE_MS) return null;
         const aheadS = this.isPredicting ? (timeMs - pose.timeMs) / 1000 : 0;
         predictPose(this.#target, pose.T_map_body, pose.velocity ?? STILL, pose.angularVelocity ?? STILL, aheadS);
         multiply(this.#target, this.#target, this.alignment.T_body_viewer);
@@ -199,7 +212,7 @@ export class Placement {
         const cm = 100 * Math.hypot(xi[3], xi[4], xi[5]);
         const degrees = (180 / Math.PI) * Math.hypot(xi[0], xi[1], xi[2]);
         const size = `${cm.toFixed(1)} cm and ${degrees.toFixed(1)}°`;
-        this.onNotice(`${this.#hasJumped}: what is drawn moves by ${size} within ${EASE_MS / 1000} s`);
+        this.onNotice(`${this.#hasJumped}; all moves by ${size} within ${EASE_MS / 1000} s`);
     }
 
     #noteDrift(timeMs) {

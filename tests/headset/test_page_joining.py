@@ -1,0 +1,75 @@
+"""The page in two files."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from share.headset.page_joining import joined_html, joined_module
+from share.headset.page_requests import FOLDER, PageGuard, read_page
+
+PAGE = {one.name: one.read_text() for one in FOLDER.iterdir()}
+
+
+def test_the_page_is_two_files_and_its_policy_knows_what_is_in_them() -> None:
+    files = read_page()
+    html, module = (files[path].body.decode() for path in ("/", "/main.js"))
+    assert re.findall(r'(?:src|href)="([^"]*)"', html) == ["data:,", "", "main.js"]
+    assert not re.search(r"^import\b", module, re.MULTILINE)
+    assert re.findall(r"^export .*", module, re.MULTILINE) == [
+        'export const app = new App(document.getElementById("view"));'
+    ]
+    for name in PAGE:
+        if name.endswith(".js") and name not in ("main.js", "loading.js"):
+            assert module.count(f"const module_{name[:-3].replace('-', '_')} = ") == 1
+    policy = PageGuard("https", (), files).headers("127.0.0.1")["Content-Security-Policy"]
+    for kind in ("script", "style"):
+        assert re.search(rf"{kind}-src 'self' 'sha256-[A-Za-z0-9+/]{{43}}=';", policy)
+    assert "unsafe" not in policy
+
+
+def test_a_module_comes_after_what_it_imports_once() -> None:
+    files = {
+        "main.js": 'import { a as b } from "./x-y.js";\n'
+        'import { z } from "./z.js";\nexport const c = b + z;\n',
+        "x-y.js": 'import { z } from "./z.js";\nconst hidden = 1;\nexport function a() { return z; }\n',
+        "z.js": "const hidden = 2;\nexport class Z {}\nexport const z = hidden;\n",
+    }
+    assert joined_module("main.js", files) == (
+        "const module_z = (() => {\nconst hidden = 2;\nclass Z {}\nconst z = hidden;\n"
+        "\nreturn { Z, z };\n})();\n"
+        "const module_x_y = (() => {\nconst { z } = module_z;\nconst hidden = 1;\n"
+        "function a() { return z; }\n\nreturn { a };\n})();\n"
+        "const { a: b } = module_x_y;\nconst { z } = module_z;\nexport const c = b + z;\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'import "./z.js";',
+        'import * as z from "./z.js";',
+        'import z from "./z.js";',
+        "import { z } from './z.js';",
+        "export default 1;",
+        "export async function f() {}",
+        "export { z };",
+        "export let z = 1;",
+        "const here = import.meta.url;",
+    ],
+)
+def test_what_is_not_known_is_not_guessed(text: str) -> None:
+    with pytest.raises(ValueError, match=r"one\.js: cannot be joined: "):
+        joined_module("one.js", {"one.js": text, "z.js": ""})
+    with pytest.raises(ValueError, match="imports itself"):
+        joined_module("a.js", {"a.js": 'import { b } from "./b.js";', "b.js": 'import { a } from "./a.js";'})
+
+
+def test_style_and_small_scripts_are_in_the_html() -> None:
+    html = '<link rel="stylesheet" href="a.css"><script src="b.js"></script><script type="module" src="m.js">'
+    files = {"a.css": "p { }", "b.js": "1 < 2;\n"}
+    assert (
+        joined_html(html, files)
+        == '<style>p { }</style><script>1 < 2;\n</script><script type="module" src="m.js">'
+    )
