@@ -118,7 +118,7 @@ class KeyframeLookup:
         if node_id not in views:
             return  # removed meanwhile
         agent = self._atlas.key(node_id).agent
-        excluded = self._atlas.graph.odometry.neighbours(node_id) + (*self._own_while_unplaced(node_id),)
+        excluded = (*self._atlas.graph.odometry.neighbours(node_id), *self._own_while_unplaced(node_id))
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self._atlas.quarantine.quarantined_nodes(agent)
         found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
