@@ -90,12 +90,10 @@ _MAX_CANDIDATES = 3
 _MAX_PER_SEGMENT = 2  # so that loops with other agents come too
 
 
-def nearby_candidates(
-    graph: MapGraph, node_id: int, eligible: AbstractSet[int], left_out: AbstractSet[int] = frozenset()
-) -> list[int]:
+def nearby_candidates(graph: MapGraph, node_id: int, eligible: AbstractSet[int]) -> list[int]:
     """Return the keyframes of the map, of those eligible, that see most of what this one sees, best first;
-    without its neighbours by odometry and those left out."""
-    excluded = {node_id, *graph.odometry.neighbours(node_id), *left_out}
+    without its neighbours by odometry."""
+    excluded = {node_id, *graph.odometry.neighbours(node_id)}
     chosen: list[int] = []
     per_segment = Counter[int]()
     for near_id in _nearest_first(graph, node_id):

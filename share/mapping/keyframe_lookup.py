@@ -53,12 +53,13 @@ class KeyframeLookup:
         self._is_revisit = self.revisits.note_lookup(node_id)
         if entries := self._views.next_restored():
             yield from self.index(entries)
-        aligned = yield from self._align_nearby(node_id)
+        is_placed = self._atlas.is_placed(node_id)
+        is_aligned = is_placed and (yield from self._align_nearby(node_id))
         seeks_maps = len(self._atlas.map_sizes()) > 1 and not self._queries.has_backlog
-        if aligned and not seeks_maps and node_id % _RECHECK_INTERVAL and self._atlas.is_placed(node_id):
+        if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
             return  # the map is right here; the keyframe is described when nothing waits
         yield from self.describe(node_id)
-        yield from self._query(node_id, aligned)
+        yield from self._query(node_id, is_aligned, is_placed)
 
     def index(self, entries: Sequence[IndexEntry]) -> Job:
         """Index restored keyframes."""
@@ -81,56 +82,40 @@ class KeyframeLookup:
         damaged = [] if image.is_intact else [MapEvent(key.agent, "odometry suspect", reason)]
         yield [*damaged, *self._review_joins(node_id)]
 
-    def _align_nearby(self, node_id: int) -> Generator[Any, Any, set[int]]:
-        """Align the images of keyframes near this one by the map's poses. Return those that did."""
-        views, aligned = self._views, set[int]()
+    def _align_nearby(self, node_id: int) -> Generator[Any, Any, bool]:
+        """Align the images of keyframes near this one by the map's poses. Return whether one did."""
+        views, is_aligned = self._views, False
         if views.image(node_id) is None:
-            return aligned
-        left_out = self._own_while_unplaced(node_id) | self._looped(node_id)
-        for candidate in nearby_candidates(self._atlas.graph, node_id, views.with_image(), left_out):
-            if aligned and self._queries.has_backlog:
+            return False
+        for candidate in nearby_candidates(self._atlas.graph, node_id, views.with_image()):
+            if is_aligned and self._queries.has_backlog:
                 break
             if not {node_id, candidate} <= views.by_node.keys():
                 continue  # removed meanwhile
-            if not self._is_gated(node_id, candidate) and (
-                yield from self._check(self._align_step(node_id, candidate), None)
-            ):
-                aligned.add(candidate)
-        return aligned
+            if not self._is_gated(node_id, candidate):
+                is_aligned |= yield from self._check(self._align_step(node_id, candidate), None)
+        return is_aligned
 
-    def _own_while_unplaced(self, node_id: int) -> set[int]:
-        """Return the other keyframes of an agent that waits to enter another's map: only loops with others
-        tell where it is there."""
-        if self._atlas.is_placed(node_id):
-            return set()
-        odometry = self._atlas.graph.odometry
-        return set(odometry.segments[odometry.nodes[node_id].segment].nodes)
-
-    def _looped(self, node_id: int) -> set[int]:
-        """Return the keyframes that a keyframe looked up again has a loop with already."""
-        edges = self._atlas.graph.edges
-        ends = (edges.by_id[n] for n in edges.incident(node_id) if n in edges.loops)
-        return {end for edge in ends for end in (edge.a, edge.b)} if self._is_revisit else set()
-
-    def _query(self, node_id: int, aligned: set[int]) -> Job:
-        """Query with a keyframe and check the candidates. aligned: those that are."""
+    def _query(self, node_id: int, is_aligned: bool, is_placed: bool) -> Job:
+        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`. is_placed: the
+        agent does not wait to enter another's map. If it does, only loops with others tell where it is, and
+        only those found without the map's pose: aligned from a pose that is wrong, images confirm it.
+        """
         views, place = self._views.by_node, self._config.place
         if node_id not in views:
             return  # removed meanwhile
         agent = self._atlas.key(node_id).agent
-        excluded = (*self._atlas.graph.odometry.neighbours(node_id), *self._own_while_unplaced(node_id))
+        excluded = self._not_compared(node_id, is_placed)
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self._atlas.quarantine.quarantined_nodes(agent)
         found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
         if node_id not in views:
             yield []
             return
-        is_recheck = node_id % _RECHECK_INTERVAL == 0
-        left_out = aligned | self._looped(node_id)
-        known = [one.id for one in found if one.id in views and one.id not in left_out]
-        is_right_here = bool(aligned) and self._atlas.is_placed(node_id)
+        is_recheck = not is_placed or node_id % _RECHECK_INTERVAL == 0
+        known = [candidate.id for candidate in found if candidate.id in views]
         by_map, by_appearance = choose_checks(
-            self._atlas.graph, node_id, known, self._views.with_image(), is_right_here, is_recheck
+            self._atlas.graph, node_id, known, self._views.with_image(), is_aligned, is_recheck
         )
         if self._queries.has_backlog:
             by_appearance = larger_maps_first(self._atlas.graph, by_appearance)
@@ -145,11 +130,21 @@ class KeyframeLookup:
                 make_step = self._align_step if candidate in by_map else self._verify_step
                 yield from self._check(make_step(node_id, candidate), search)
 
+    def _not_compared(self, node_id: int, is_placed: bool) -> tuple[int, ...]:
+        """Return the keyframes that are not compared with this one: those near it on its segment. Of an agent
+        that is not placed all, and those with which it has a loop, or a pending one, by an earlier look-up:
+        the same pair is no further evidence."""
+        graph = self._atlas.graph
+        if is_placed:
+            return graph.odometry.neighbours(node_id)
+        own = graph.odometry.segments[graph.odometry.nodes[node_id].segment].nodes
+        key, edges = self._atlas.key(node_id), graph.edges
+        loops = [edges.loops[n] for n in edges.incident(node_id) if n in edges.loops]
+        loops += [loop for loop in self._atlas.loop_acceptance.pending if key in loop.keyframes]
+        return (*own, *(n for loop in loops for n in graph.loop_nodes(loop)))
+
     def _is_gated(self, node_id: int, candidate: int) -> bool:
-        """Return whether the merge gate leaves out this keyframe of the same map, by the map's poses; none
-        where the place of the agent is not known well enough."""
-        if not self._atlas.is_placed(node_id):
-            return False
+        """Return whether the merge gate leaves out this keyframe of the same map, by the map's poses."""
         a, b = self._atlas.key(candidate), self._atlas.key(node_id)
         T_a_b = self._atlas.graph.relative_pose(candidate, node_id)
         objection = self._merge_gate.skip_reason(self._overlap_volume(a, b, T_a_b), same_map=True)
