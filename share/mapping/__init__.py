@@ -4,6 +4,7 @@ Begin with `mapper.Mapper`: `keyframe_lookup.KeyframeLookup.look_up` is a keyfra
 that of a map that has changed:
 
     query_queue          which keyframe is looked up next
+    revisits             which is looked up again, of an agent that waits to enter another's map
     candidates           which others it is compared with, and how
     recognition          align the images of keyframes nearby (`recognition.patch_alignment`); find others
                          (`recognition.index`), verify (`recognition.verification`) and align them

@@ -86,6 +86,25 @@ class Atlas:
         newest = self.graph.odometry.newest_node(agent)
         return None if newest is None else self.graph.T_map_odom(newest)
 
+    def is_placed(self, node_id: int) -> bool:
+        """Return whether a keyframe's segment is shown its map, and does not wait to enter another's."""
+        segment = self.graph.odometry.nodes[node_id].segment
+        reference_segment = self.graph.reference_segments[segment]
+        return segment == reference_segment or self._localisation_gate.is_published(
+            segment, reference_segment
+        )
+
+    def waiting_segments(self) -> list[int]:
+        """Segments of connected agents that wait to enter another's map."""
+        odometry = self.graph.odometry
+        return [
+            segment
+            for segment in odometry.live_segments
+            if odometry.current_segment(agent := odometry.segments[segment].agent) == segment
+            and not self._runs.is_absent(agent)
+            and not self.is_placed(odometry.segments[segment].nodes[-1])
+        ]
+
     def all_poses(self) -> SavePoses:
         """Current pose and map of every keyframe."""
         graph, nodes = self.graph, self.graph.odometry.nodes
@@ -236,11 +255,12 @@ class Atlas:
 
     # Loops
 
-    def propose(self, loop: Loop) -> LoopDecision:
-        """Decide on a verified loop from candidate a to query b. Raises ValueError for unknown keyframes."""
+    def propose(self, loop: Loop, is_answer: bool = True) -> LoopDecision:
+        """Decide on a verified loop from candidate a to query b. is_answer: to the query, which is new.
+        Raises ValueError for unknown keyframes."""
         if reason := self.quarantine.separation_reason(loop):
             return LoopDecision(False, f"loop {loop}: {reason}")
         decision = self.loop_acceptance.decide(loop)
-        if decision.accepted:  # also answers for pending loops accepted with it
+        if decision.accepted and is_answer:  # also answers for pending loops accepted with it
             self.solving.mark_answered(loop.b)
         return decision

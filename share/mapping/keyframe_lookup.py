@@ -20,6 +20,7 @@ from share.mapping.mapper_log import MapperLog
 from share.mapping.query_queue import CandidateSearch, QueryQueue
 from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeViews
 from share.mapping.recognition.verification import Refusal, Verification
+from share.mapping.revisits import Revisits
 from share.mapping.steps import AlignStep, DescribeStep, IndexStep, Job, QueryStep, VerifyStep
 from share.scheduling.merge_gate import MergeGate
 from share.types import F64, View
@@ -44,17 +45,21 @@ class KeyframeLookup:
         self._config, self._atlas, self._views, self._queries = config, atlas, views, queries
         self._hellos, self._log, self._counters = hellos, log, log.counters
         self._merge_gate = MergeGate(config.control, config.edge.policy)
+        self.revisits = Revisits(atlas.graph)
+        self._is_revisit = False  # the keyframe that is looked up was before
 
     def look_up(self, node_id: int) -> Job:
         """Find loops of a keyframe: with keyframes near it in its map, then with those that look alike."""
+        self._is_revisit = self.revisits.note_lookup(node_id)
         if entries := self._views.next_restored():
             yield from self.index(entries)
-        is_aligned = yield from self._align_nearby(node_id)
+        is_placed = self._atlas.is_placed(node_id)
+        is_aligned = is_placed and (yield from self._align_nearby(node_id))
         seeks_maps = len(self._atlas.map_sizes()) > 1 and not self._queries.has_backlog
         if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
             return  # the map is right here; the keyframe is described when nothing waits
         yield from self.describe(node_id)
-        yield from self._query(node_id, is_aligned)
+        yield from self._query(node_id, is_aligned, is_placed)
 
     def index(self, entries: Sequence[IndexEntry]) -> Job:
         """Index restored keyframes."""
@@ -91,20 +96,23 @@ class KeyframeLookup:
                 is_aligned |= yield from self._check(self._align_step(node_id, candidate), None)
         return is_aligned
 
-    def _query(self, node_id: int, is_aligned: bool) -> Job:
-        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`."""
+    def _query(self, node_id: int, is_aligned: bool, is_placed: bool) -> Job:
+        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`. is_placed: the
+        agent does not wait to enter another's map. If it does, only loops with others tell where it is, and
+        only those found without the map's pose: aligned from a pose that is wrong, images confirm it.
+        """
         views, place = self._views.by_node, self._config.place
         if node_id not in views:
             return  # removed meanwhile
         agent = self._atlas.key(node_id).agent
-        excluded = self._atlas.graph.odometry.neighbours(node_id)
+        excluded = self._not_compared(node_id, is_placed)
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
             excluded += self._atlas.quarantine.quarantined_nodes(agent)
         found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
         if node_id not in views:
             yield []
             return
-        is_recheck = node_id % _RECHECK_INTERVAL == 0
+        is_recheck = not is_placed or node_id % _RECHECK_INTERVAL == 0
         known = [candidate.id for candidate in found if candidate.id in views]
         by_map, by_appearance = choose_checks(
             self._atlas.graph, node_id, known, self._views.with_image(), is_aligned, is_recheck
@@ -121,6 +129,19 @@ class KeyframeLookup:
             if not is_same_map or is_recheck or not self._is_gated(node_id, candidate):
                 make_step = self._align_step if candidate in by_map else self._verify_step
                 yield from self._check(make_step(node_id, candidate), search)
+
+    def _not_compared(self, node_id: int, is_placed: bool) -> tuple[int, ...]:
+        """Return the keyframes that are not compared with this one: those near it on its segment. Of an agent
+        that is not placed all, and those with which it has a loop, or a pending one, by an earlier look-up:
+        the same pair is no further evidence."""
+        graph = self._atlas.graph
+        if is_placed:
+            return graph.odometry.neighbours(node_id)
+        own = graph.odometry.segments[graph.odometry.nodes[node_id].segment].nodes
+        key, edges = self._atlas.key(node_id), graph.edges
+        loops = [edges.loops[n] for n in edges.incident(node_id) if n in edges.loops]
+        loops += [loop for loop in self._atlas.loop_acceptance.pending if key in loop.keyframes]
+        return (*own, *(n for loop in loops for n in graph.loop_nodes(loop)))
 
     def _is_gated(self, node_id: int, candidate: int) -> bool:
         """Return whether the merge gate leaves out this keyframe of the same map, by the map's poses."""
@@ -179,7 +200,9 @@ class KeyframeLookup:
         change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
         self._log.record_loops(change)
         events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
-        decision = atlas.propose(atlas.quarantine.rescale_loop(loop, outcome.depth_scale))
+        decision = atlas.propose(
+            atlas.quarantine.rescale_loop(loop, outcome.depth_scale), is_answer=not self._is_revisit
+        )
         self._log.record_loops(decision)
         reason = f"{decision.reason} ({outcome.reason})"
         if not decision.accepted:

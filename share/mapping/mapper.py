@@ -118,6 +118,7 @@ class Mapper:
         for keyframe in removed:
             self.views.remove(keyframe.node_id)
             self._retention.remove(keyframe.node_id)
+            self._lookup.revisits.remove(keyframe.node_id)
         self._counters.removed_keyframes += len(removed)
         for agent in sorted({keyframe.key.agent for keyframe in removed}):
             if self.atlas.is_run_gone(agent):
@@ -161,6 +162,8 @@ class Mapper:
         while (node_id := self._next_query()) is not None:
             if node_id in self.views.by_node:
                 return self._lookup.look_up(node_id)
+        if (node_id := self._lookup.revisits.next_node(self.atlas.waiting_segments())) is not None:
+            return self._lookup.look_up(node_id)
         if entries := self.views.next_restored():
             return self._lookup.index(entries)
         node_id = self.views.next_undescribed()

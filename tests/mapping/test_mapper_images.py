@@ -13,7 +13,7 @@ from helpers import textured_planes
 from helpers.hellos import NOISE, hello_of
 from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
 
-from share.config import Config, ControlConfig
+from share.config import Config, ControlConfig, MergeConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.mapping.graph.solver import PoseGraphSolver
@@ -57,8 +57,8 @@ def place() -> Planes:
     return Planes(ROOM, seed=3)
 
 
-def mapper_of(*names: str, control: ControlConfig | None = None) -> Mapper:
-    mapper = Mapper(Config(control=control or ControlConfig()))
+def mapper_of(*names: str, control: ControlConfig | None = None, enter_m: float = 0.025) -> Mapper:
+    mapper = Mapper(Config(control=control or ControlConfig(), merge=MergeConfig(enter_m=enter_m)))
     for k, name in enumerate(names):
         mapper.add_run(name, replace(hello_of(name, k + 1), rig=RIG))
     return mapper
@@ -112,6 +112,28 @@ def test_two_agents_join_by_their_images_and_are_then_aligned_by_the_map(place: 
             assert np.linalg.norm(off[3:]) < 0.004
             assert np.degrees(np.linalg.norm(off[:3])) < 0.15
     assert mapper.report()["failed_steps"] == 0
+
+
+@pytest.mark.long
+def test_who_waits_is_compared_with_others_alone_without_the_maps_pose_and_again(place: Planes) -> None:
+    """Images aligned from a wrong pose would confirm it."""
+    mapper = mapper_of("ann", "bob", enter_m=1e-6)
+    for _, sent in keyframes(place, -0.1, 1):
+        mapper.add_keyframe("ann", sent)
+    work(mapper)
+    alone, waiting = list[Step](), list[Step]()
+    for _, sent in keyframes(place, 0.0, 2, steps=6):
+        mapper.add_keyframe("bob", sent)
+        steps = waiting if len(mapper.atlas.map_sizes()) == 1 else alone
+        steps += [step for step, _ in work(mapper)]
+    assert mapper.atlas.map_sizes() == {"ann/0": 10}
+    assert waiting and not any(isinstance(step, AlignStep) for step in waiting)
+    verified = [step for step in alone + waiting if isinstance(step, VerifyStep)]
+    of_bob = [step for step in verified if mapper.atlas.key(step.node_id).agent == "bob"]
+    assert {mapper.atlas.key(step.candidate_id).agent for step in of_bob} == {"ann"}
+    assert len(of_bob) == len({(step.node_id, step.candidate_id) for step in of_bob})
+    first = [step.candidate_id for step in of_bob if mapper.atlas.key(step.node_id).id == 0]
+    assert len(first) == 4  # three at first, and the last of ann's once bob is known to be there
 
 
 def _all_poses(mapper: Mapper) -> tuple[list[tuple[str, int]], np.ndarray]:

@@ -91,7 +91,7 @@ def test_the_report_counts_keyframes_loops_and_merges(joined):
     assert ann["keyframes"] == 24
     assert ann["poses"] > 0
     assert report["loops"]["accepted"] == sum(a["loops"]["accepted"] for a in report["agents"].values()) > 0
-    assert report["place_ms"]["n"] == 48
+    assert 48 < report["place_ms"]["n"] < 60  # some of bob's again, while it waits to enter ann's map
     assert report["failed_steps"] == 0
     assert sum(report["maps"].values()) == 48
 
