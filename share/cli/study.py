@@ -16,7 +16,7 @@ import click
 from share.cli import options
 from share.cli.commands import CommandGroup
 from share.cli.terminal import print_note
-from share.config import POLICY_NAMES
+from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     "--policy",
     "policies",
     multiple=True,
-    type=click.Choice(POLICY_NAMES),
+    type=click.Choice([name for name in POLICY_NAMES if name != STREAMED]),  # that builds no map
     help="A condition; 2 to 8 of them.  [default: the paper's: share, covins-g, linear, equal]",
 )
 @click.option(
