@@ -1,4 +1,4 @@
-"""`share study`: plan a study with people by letters, unblind it at its end, analyse it."""
+"""`share study`: plan a study with people by letters, lead it, unblind it at its end, analyse it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
+from share.cli.study_run import run
 from share.cli.terminal import print_note
 from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
@@ -27,10 +28,11 @@ if TYPE_CHECKING:
 
 @click.group(cls=CommandGroup, prefix="study ")
 def study() -> None:
-    """Plan a blind study with people, unblind it at its end, and analyse it.
+    """Plan a blind study with people, lead its participants, unblind it at its end, and analyse it.
 
     \b
     Example:  share study plan --participants 20 --out study
+              share study run study
               share study analyze study --out first-look
               share study unblind study --key study-key.json
               share study analyze study --out report
@@ -183,6 +185,9 @@ def _write_plan(plan_path: Path, key_path: Path, plan: StudyPlan, key_text: str)
     except BaseException:
         key_path.unlink(missing_ok=True)  # ours, of a plan that does not exist
         raise
+
+
+study.add_command(run)
 
 
 @study.command(short_help="Tell the policies behind the letters, once all trials are done.")

@@ -133,7 +133,7 @@ def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str
                     where,
                 )
             for kind in _CHOICES:
-                if kind in row:
+                if row.get(kind) is not None:
                     if choices[kind][people[person]]:
                         raise DataError(f"{where}: {person} has said before which is {kind} preferred")
                     choices[kind][people[person]] = _known_letter(row[kind], letters, where)
