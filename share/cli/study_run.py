@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
-import socket
 import sys
 import threading
 from contextlib import ExitStack, closing
@@ -115,15 +114,17 @@ def _locked(trials: Path) -> int:
 
 def _open_page(address: str, folder: Path, words: PageWords, stderr: Stderr) -> QuestionPage:
     """Serve the page of questions; where others reach it, with a token that the study keeps."""
+    from share.headset.headset_page import shown_host
     from share.lab.study.question_page import QuestionPage
     from share.net.http_guard import read_token, served_address
 
     is_local = served_address(address).local
     token = None if is_local else read_token(folder / _TOKEN)
     page = QuestionPage(address, words, token)
-    host = page.endpoint.replace("0.0.0.0", socket.gethostname())
+    host, _, port = page.endpoint.rpartition(":")
+    shown = f"{shown_host(host.strip('[]'))}:{port}"
     query = "" if token is None else f"?token={token}"
-    stderr.print_line(f"questions at http://{host}/{query}")
+    stderr.print_line(f"questions at http://{shown}/{query}")
     return page
 
 

@@ -103,5 +103,6 @@ def read_wording(path: Path, plan: StudyPlan) -> tuple[tuple[StudyQuestion, ...]
             f"{path}: asks something else than the plan, which has {names}; only words may differ"
         )
     with read_errors(path, UsageError):
-        words = parse_yaml(read_text(path, MAX_SETTINGS_BYTES, "utf-8-sig"), str(path)).get("words")
-    return questions, PageWords() if words is None else from_mapping(PageWords, words, f"{path}: words")
+        data = parse_yaml(read_text(path, MAX_SETTINGS_BYTES, "utf-8-sig"), str(path))
+    words = data.get("words") if "words" in data else {}
+    return questions, from_mapping(PageWords, words, f"{path}: words")

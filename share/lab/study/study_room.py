@@ -29,7 +29,7 @@ from share.protocol.room_events import ClientEffect, MessageWanted
 from share.runtime.room_link import RoomLink
 from share.wire.room_messages import Cancel, Goto, ObjectKind, PutObject, RemoveObject, RoomObject
 
-_START_S = 60.0  # for the edge, on a busy machine
+_START_S = 120.0  # for the edge, on a busy machine
 _HTTP_S = 1.0
 SILENT_S = 5.0  # an edge that does not answer for so long is gone
 _LISTENING, _STATUS, _KEY = r"listening on (tcp://\S+?),", r"status at http://(\S+?)/", r"public key '(\S+)';"
@@ -184,9 +184,9 @@ class StudyRoom:
         message = PutObject(next(self._link.numbers), SPOT_ID, ObjectKind.MARKER, floor.map_id, pose)
         self._link.handle(MessageWanted(message))
 
-    def hide_spot(self) -> None:
-        if SPOT_ID in self.objects:
-            self._link.handle(MessageWanted(RemoveObject(next(self._link.numbers), SPOT_ID)))
+    def remove(self, object_id: int) -> None:
+        if object_id in self.objects:
+            self._link.handle(MessageWanted(RemoveObject(next(self._link.numbers), object_id)))
 
     def send_robot(self, floor: StudyFloor, place: tuple[float, float]) -> int:
         """Return the number of the command."""

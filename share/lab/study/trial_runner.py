@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from share.errors import ShareError
 from share.lab.study import trial_machine as tm
 from share.lab.study.event_log import EventLog, free_bytes
-from share.lab.study.floor import STUDY_NAME, StudyFloor, find_markers, floor_of
+from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor, find_markers, floor_of
 from share.lab.study.readiness import Readiness, RoomState, check_room
 from share.lab.study.study_room import StudyRoom
 from share.protocol.room_events import CommandChanged, ObjectChanged, RobotSeen
@@ -67,6 +67,7 @@ class TrialRunner:
         self._command: int | None = None
         self._marker_id: int | None = None
         self._cubes: dict[int, tm.Place | None] = {}  # on the floor
+        self._called_cubes: set[int] = set()
         self._broken_reason = ""
         self._began_s = time.monotonic()
         self._offset_s = 0.0
@@ -173,6 +174,7 @@ class TrialRunner:
                     self._researcher.say(effect.text)
                 case tm.ShowSpot():
                     self._shown = effect.called
+                    self._remove_cubes()
                     self._show_spot()
                 case tm.SendRobot():
                     self._send(effect.place)
@@ -187,6 +189,12 @@ class TrialRunner:
         floor = self._floor
         if floor is not None and self._shown is not None:
             self._room.show_spot(floor, self._shown.place)
+
+    def _remove_cubes(self) -> None:
+        """Take away the cubes that have called: an edge takes 16 objects of a wearer."""
+        for number in self._called_cubes & self._room.objects.keys():
+            self._room.remove(number)
+        self._called_cubes.clear()
 
     def _send(self, place: tm.Place) -> None:
         floor = self._floor
@@ -240,6 +248,7 @@ class TrialRunner:
         self._cubes[cube.object_id] = place or before
         # one that goes with its map does not move on the floor, before or after the floor's marker does
         if is_new or (place is not None and (before is None or math.dist(place, before) > _MOVED_M)):
+            self._called_cubes.add(cube.object_id)
             self._handle(tm.CubeSeen(place))
 
     def _place_cubes(self) -> None:
@@ -260,7 +269,8 @@ class TrialRunner:
         if self._room.broken() is not None:
             return
         with contextlib.suppress(ShareError):
-            self._room.hide_spot()
+            self._remove_cubes()
+            self._room.remove(SPOT_ID)
             end_s = time.monotonic() + _END_S
             while not self._room.is_idle and time.monotonic() < end_s:
                 self._room.step(_STEP_MS)
