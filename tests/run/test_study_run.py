@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -84,13 +83,14 @@ class RunningStudy:
 
 
 @pytest.fixture
-def address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
     study_map(Path("room.sqlite"))
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
-        yield f"tcp://127.0.0.1:{one.getsockname()[1]}"
+        port = one.getsockname()[1]
+    return f"tcp://127.0.0.1:{port}"
 
 
 def plan(share: Any, *options: object, spots: int = 3) -> StudyPlan:

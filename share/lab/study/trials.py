@@ -113,6 +113,10 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
             kind = event["event"]
             if kind == "begin":
                 _check_begin(event, wanted, where)
+                if record.judge not in ("", event["judge"]):
+                    raise DataError(
+                        f"{where}: judge {event['judge']}, before {record.judge}; a trial has one"
+                    )
                 record.judge = event["judge"]
             elif not record.judge:
                 raise DataError(f"{where}: {kind} before begin")
