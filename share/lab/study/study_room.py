@@ -45,8 +45,8 @@ class EdgeOptions:
 
     def __post_init__(self) -> None:
         for one in self.given:
-            if one.partition("=")[0] in _OWN_OPTIONS:
-                raise UsageError(f"{one}: the study sets it; leave it out behind --")
+            if (name := one.partition("=")[0]) in _OWN_OPTIONS:
+                raise UsageError(f"{name}: the study sets it; leave it out behind --")
 
     def value(self, name: str) -> str | None:
         """Return the last value of an option, None where it is not given."""
@@ -125,10 +125,11 @@ class StudyRoom:
         raise ShareError(f"the edge did not start: {self._last_line}")
 
     def show_log(self) -> None:
-        """Show the researcher what the edge has said since."""
+        """Show the researcher what the edge has said since, but of the study's own doings."""
         for line in self._log.new_lines():
             self._said.append(line)
-            self.say(f"edge: {line}")
+            if f"'{STUDY_NAME}'" not in line:
+                self.say(f"edge: {line}")
 
     @property
     def _last_line(self) -> str:

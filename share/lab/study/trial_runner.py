@@ -138,6 +138,8 @@ class TrialRunner:
         try:
             self._log.append(begin)
             self._carry_out(self._machine.begin())
+            if self._robot is not None:
+                self._tell_robot(self._robot[1])
             while not self._machine.is_over:
                 self._step()
         except BaseException:
