@@ -23,6 +23,7 @@ from share.robot.settings import CREATE3_SPEED_M_S
 CUBE_RESTS_S = 0.5
 SEND_AGAIN_S = 1.0  # after a refusal, or where the robot's map moved
 _STOPS_WITHIN_S = 5.0  # after a goal's end, or its time-out: then the next spot is shown anyway
+_SEEN_AFTER_S = 0.3  # the end of a goal, the robot is seen to stand
 _MAX_STATUS_LENGTH = 100
 _MAP_GOES_ON = ("the map", "a correction moved", "the robot now in")  # reasons to send the robot again
 
@@ -256,9 +257,15 @@ class TrialMachine:
                 self._send_again_s = None
                 self._effects.append(SendRobot(self._target))
         elif self.stage is TrialStage.STANDSTILL:
-            stands = self._watch.stands_since() is not None
+            stands = self._watch.stands_since() is not None and self._is_seen_since_end
             if stands or now_s - self._ended_s > _STOPS_WITHIN_S:
                 self._finish_goal(stands)
+
+    @property
+    def _is_seen_since_end(self) -> bool:
+        """Whether the newest place is later than the goal's end, as it comes by another way than that."""
+        newest = self._watch.newest
+        return newest is not None and newest.t_s >= self._ended_s + _SEEN_AFTER_S
 
     def _on_time_out(self) -> None:
         self._is_late, self._ended_s = True, self._now_s

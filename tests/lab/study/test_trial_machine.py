@@ -187,6 +187,18 @@ def test_a_robot_that_is_there_already_stands_from_the_call_on(bench: TrialBench
     assert stands["t_s"] == pytest.approx(called_s) and not bench.lines("moves")
 
 
+def test_a_robot_that_is_told_to_be_there_before_it_is_seen_there(bench: TrialBench) -> None:
+    bench.do(tm.CallPressed())
+    bench.wait(1.4)  # it is still seen where it was called
+    bench.told("reached", is_reached=True)
+    bench.do(tm.TimePassed())
+    assert not bench.lines("status")
+    bench.at = (1.0, 1.2)
+    bench.wait(2.0)
+    assert [one["robot_m"] for one in bench.lines("stands")] == [[1.0, 1.2]]
+    assert len(bench.lines("moves")) == len(bench.lines("status")) == 1
+
+
 def test_a_robot_whose_place_is_unknown_is_called_all_the_same(bench: TrialBench) -> None:
     bench.at = None
     bench.wait(1.0)

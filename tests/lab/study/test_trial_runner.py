@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,6 @@ import pytest
 from share.errors import ShareError
 from share.geometry.se3 import from_rt, so3_exp
 from share.lab.study import trial_machine as tm
-from share.lab.study import trial_runner
 from share.lab.study.event_log import EventLog
 from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor
 from share.lab.study.plan import SuccessRule
@@ -142,7 +142,7 @@ class RunnerBench:
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunnerBench]:
     bench = RunnerBench(tmp_path)
-    monkeypatch.setattr(trial_runner.time, "monotonic", lambda: bench.clock[0])
+    monkeypatch.setattr(time, "monotonic", lambda: bench.clock[0])
     yield bench
     bench.log.close()
 
@@ -229,7 +229,7 @@ def test_the_researcher_ends_the_trial_and_the_robot_stops(bench: RunnerBench) -
         bench.researcher.wants_end = step >= 30
         if step == 20:
             bench.researcher.typed.append("")
-            bench.room.send_robot = lambda floor, place: 5  # type: ignore[method-assign,misc]
+            bench.room.send_robot = lambda floor, place: 5  # type: ignore[method-assign]
 
     bench.room.at_step = end
     with pytest.raises(TrialInterruptedError, match="ended by the researcher"):
