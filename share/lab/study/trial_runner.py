@@ -82,6 +82,7 @@ class TrialRunner:
         has_warned, was_well = False, False
         checks: list[Readiness] = []
         due_s = 0.0
+        self._researcher.forget_typed()
         while True:
             self._take_news(_STEP_MS)
             self._end_if_broken()
@@ -105,6 +106,7 @@ class TrialRunner:
                 return bad
             else:
                 has_warned = True
+                self._researcher.forget_typed()
                 self._researcher.say(f"not well: {', '.join(bad)}; Enter again begins all the same")
 
     def _state(self) -> RoomState:
@@ -123,6 +125,7 @@ class TrialRunner:
         )
         self._began_s, self._offset_s = time.monotonic(), header.last_s
         self._place_cubes()
+        self._researcher.forget_typed()
         report, _ = self._room.report()
         sealed = {} if report is None else report.get("config", {})
         begin = {
