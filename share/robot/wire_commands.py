@@ -47,8 +47,8 @@ class WireCommands:
 
     def __init__(self) -> None:
         self._known: dict[tuple[type, str, int], BridgeCommand] = {}
-        self._progress_timer, self._place_timer = PeriodicTimer(_PROGRESS_S), PeriodicTimer(_PLACE_S)
-        self._driven_timer = PeriodicTimer(_DRIVEN_PLACE_S)
+        self._progress_timer = PeriodicTimer(_PROGRESS_S)
+        self._place_ns: int | None = None  # when the last place was told
 
     def take(
         self, command: Goto | Cancel, make_goal_id: Callable[[], bytes], now_ns: int
@@ -128,11 +128,14 @@ class WireCommands:
 
     def due_place(self, report: Callable[[], dict[str, Any]], now_ns: int) -> RobotPlace | None:
         """Return where the robot is, twice a second, five times with a goal. report: of the bridge."""
-        if not self._driven_timer.fire_if_due(now_ns):
+        since_ns = None if self._place_ns is None else now_ns - self._place_ns
+        if since_ns is not None and since_ns < seconds_to_ns(_DRIVEN_PLACE_S):
             return None
         state = report()
-        is_due = self._place_timer.fire_if_due(now_ns)
-        return robot_place(state) if is_due or state["goal"] is not None else None
+        if since_ns is not None and since_ns < seconds_to_ns(_PLACE_S) and state["goal"] is None:
+            return None
+        self._place_ns = now_ns
+        return robot_place(state)
 
     def _make_room(self) -> bool:
         """Forget one of too many commands: the oldest final one, else one that never began, else a
