@@ -24,6 +24,7 @@ from share.lab.study.trials import TRIAL_MEASURES, TrialRecord, read_trials, tri
 from share.types import F64, I64
 
 _HEAD = ("participant", "condition", "place")
+REPEATED_CALLS = "calls repeated"  # a measure where there are any: they may come of a condition
 _CHOICES = ("most", "least")
 _MAX_CSV_BYTES, _MAX_CSV_LINES, _MAX_MEASURES = 10 * MB, MAX_PARTICIPANTS * MAX_CONDITIONS + 1, 100
 Ranges = Mapping[str, tuple[float, float]]
@@ -70,14 +71,18 @@ def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
     records = read_trials(study, plan)
     statuses: Counter[str] = Counter()
     repeated: Counter[int] = Counter()
+    recalled = np.full(shape, math.nan)
     for (name, place), record in records.items():
         cell = people.index(name), plan.letters.index(record.condition)
         places[cell] = place
         if record.is_complete:
             statuses.update(goal.status for goal in record.goals.values())
             repeated.update(record.repeated)
+            recalled[cell] = record.repeated.total()
             for measure, value in trial_measures(record.goals.values(), rule).items():
                 measures[measure][cell] = value
+    if repeated:
+        measures[REPEATED_CALLS] = recalled
     answers, choices = _read_answers(study / ANSWERS, plan)
     judges = Counter(record.judge for record in records.values())
     far = _far_cubes(records.values(), plan, rule)

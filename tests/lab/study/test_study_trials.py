@@ -12,7 +12,7 @@ import pytest
 from helpers.study_folder import begin, fill, goal_events, small_plan, write_lines
 
 from share.errors import DataError
-from share.lab.study.observations import read_study, read_table
+from share.lab.study.observations import REPEATED_CALLS, read_study, read_table
 from share.lab.study.plan import SuccessRule
 from share.lab.study.study_analysis import analyse
 from share.lab.study.study_tables import value_text
@@ -92,8 +92,13 @@ def test_repeated_calls_are_counted_by_spot(tmp_path: Path) -> None:
     assert "repeated" not in " ".join(read_study(tmp_path, PLAN, RULE).notes)
     calls = [goal_events(1, 1, None, 10.0), goal_events(1, 1, None, 50.0), goal_events(1, 1, 8.0, 90.0)]
     calls += [goal_events(2, 2, None, 200.0), goal_events(2, 2, 8.0, 300.0)]
+    assert REPEATED_CALLS not in read_study(tmp_path, PLAN, RULE).measures
     measures(*calls, study=tmp_path)
-    notes = read_study(tmp_path, PLAN, RULE).notes
+    table = read_study(tmp_path, PLAN, RULE)
+    counts = table.measures[REPEATED_CALLS]
+    letter = PLAN.letters.index(PLAN.participants[0].trials[0].condition)
+    assert counts[0, letter] == 3 and counts.sum() == 3  # a measure, compared between conditions as others
+    notes = table.notes
     assert any("3 calls were repeated" in note and note.endswith("spot 1 2, spot 2 1") for note in notes)
 
 
