@@ -31,7 +31,7 @@ from share.wire.room_messages import Cancel, Goto, ObjectKind, PutObject, Remove
 
 _START_S = 120.0  # for the edge, on a busy machine
 _HTTP_S = 1.0
-SILENT_S = 5.0  # an edge that does not answer for so long is gone
+SILENT_S = 10.0  # an edge that does not answer for so long is gone
 _LISTENING, _STATUS, _KEY = r"listening on (tcp://\S+?),", r"status at http://(\S+?)/", r"public key '(\S+)';"
 _OWN_OPTIONS = ("--policy", "--blind", "--out", "--json")
 
