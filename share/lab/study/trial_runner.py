@@ -81,7 +81,7 @@ class TrialRunner:
         shown: dict[str, str] = {}
         has_warned, was_well = False, False
         checks: list[Readiness] = []
-        due_s = 0.0
+        due_s = time.monotonic() + _CHECK_S  # objects and robot come first
         self._researcher.forget_typed()
         while True:
             self._take_news(_STEP_MS)

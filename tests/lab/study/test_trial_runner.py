@@ -271,3 +271,33 @@ def test_a_silent_bridge_is_no_standing_robot(bench: RunnerBench) -> None:
         bench.run()
     assert bench.events("call")[0]["robot_m"] is None and not bench.events("stands")
     assert math.isclose(bench.events("status")[0]["t_s"] - bench.events("call")[0]["t_s"], 5.05, abs_tol=0.3)
+
+
+def test_the_checks_come_before_the_trial_and_enter_begins_it(bench: RunnerBench) -> None:
+    """`report` has no agent, so not all is well; that is overruled by two presses, and kept."""
+
+    def press(step: int) -> None:
+        if step in (60, 80):
+            bench.researcher.typed.append("")
+
+    bench.room.at_step = press
+    unwell = bench.runner.wait_until_ready()
+    assert unwell == ["agents", "clocks", "poses", "map", "robot"] and bench.room.steps == 80
+    assert "not well: agents, clocks, poses, map, robot; Enter again begins all the same" in (
+        bench.researcher.lines
+    )
+    assert len([line for line in bench.researcher.lines if line.startswith("WAIT  agents")]) == 1  # once
+
+
+def test_no_trial_begins_without_its_floor(bench: RunnerBench) -> None:
+    bench.room.objects = {}
+
+    def press(step: int) -> None:
+        bench.researcher.typed.append("")
+        bench.researcher.wants_end = step > 100
+
+    bench.room.at_step = press
+    with pytest.raises(TrialInterruptedError, match="before it began"):
+        bench.runner.wait_until_ready()
+    assert "without the floor's marker no spot can be shown: place it first" in bench.researcher.lines
+    assert not bench.log.path.exists()
