@@ -97,7 +97,7 @@ class TrialRunner:
                 if is_well and not was_well:
                     self._researcher.say("all is well: Enter begins the trial")
                 was_well = is_well
-            if self._researcher.poll() is None:
+            if self._researcher.poll() is None or not checks:
                 continue
             bad = [one.name for one in checks if not one.is_well]
             if "marker" in bad and not find_markers(self._room.objects):
