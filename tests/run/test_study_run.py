@@ -295,7 +295,7 @@ def test_a_robot_that_does_not_come_and_no_marker(share: Any, address: str) -> N
     with StudyActors(address, reaches=False), RunningStudy(address) as study:
         study.wait("WAIT  marker   none: place one")
         study.type()
-        study.wait("without the floor's marker no spot can be shown")
+        study.wait("no spot can be shown without the floor's one marker")
         share("marker", "put", 0, 0, "--id", MARKER, "--edge", address, "--name", "lead")
         study.begin("1 of 1:")
         study.type()

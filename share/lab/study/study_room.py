@@ -189,10 +189,10 @@ class StudyRoom:
         if object_id in self.objects:
             self._link.handle(MessageWanted(RemoveObject(next(self._link.numbers), object_id)))
 
-    def send_robot(self, floor: StudyFloor, place: tuple[float, float]) -> int:
-        """Return the number of the command."""
+    def send_robot(self, floor: StudyFloor, place: tuple[float, float], robot: str | None) -> int:
+        """Return the number of the command. robot: None: the only one."""
         T, number = floor.in_map(*place), next(self._link.numbers)
-        self._link.handle(MessageWanted(Goto(number, None, "", floor.map_id, T.x, T.y)))
+        self._link.handle(MessageWanted(Goto(number, robot, "", floor.map_id, T.x, T.y)))
         return number
 
     def stop_robot(self) -> None:

@@ -64,6 +64,7 @@ class TrialRunner:
     ) -> None:
         self._room, self._log, self._researcher, self._machine = room, log, researcher, machine
         self._robot: tuple[float, RobotPlace] | None = None  # when it came
+        self._robot_name: str | None = None  # of the trial's, once it has begun
         self._command: int | None = None
         self._marker_id: int | None = None
         self._cubes: dict[int, tm.Place | None] = {}  # on the floor
@@ -100,8 +101,8 @@ class TrialRunner:
             if self._researcher.poll() is None or not checks:
                 continue
             bad = [one.name for one in checks if not one.is_well]
-            if "marker" in bad and not find_markers(self._room.objects):
-                self._researcher.say("without the floor's marker no spot can be shown: place it first")
+            if len(find_markers(self._room.objects)) != 1:
+                self._researcher.say("no spot can be shown without the floor's one marker; see above")
             elif not bad or has_warned:
                 return bad
             else:
@@ -118,11 +119,7 @@ class TrialRunner:
 
     def run(self, header: TrialHeader, unwell: list[str]) -> None:
         """Carry it through."""
-        self._marker_id = next(
-            number
-            for number, one in sorted(self._room.objects.items())
-            if one in find_markers(self._room.objects)
-        )
+        self._marker_id = find_markers(self._room.objects)[0].object_id
         self._began_s, self._offset_s = time.monotonic(), header.last_s
         self._place_cubes()
         self._researcher.forget_typed()
@@ -142,7 +139,7 @@ class TrialRunner:
             self._log.append(begin)
             self._carry_out(self._machine.begin())
             if self._robot is not None:
-                self._tell_robot(self._robot[1])
+                self._take_robot(self._robot[1])
             while not self._machine.is_over:
                 self._step()
         except BaseException:
@@ -207,16 +204,16 @@ class TrialRunner:
             told = tm.GoalTold("refused: the floor's marker is gone; place it again", True, False)
             self._handle(told)
             return
-        self._command = self._room.send_robot(floor, place)
+        self._command = self._room.send_robot(floor, place, self._robot_name)
 
     # ------------------------------------------------------------ news of the room
 
     def _take_news(self, timeout_ms: int) -> None:
         for one in self._room.step(timeout_ms):
             match one:
-                case RobotSeen():
+                case RobotSeen() if self._robot_name in (None, one.place.robot):
                     self._robot = time.monotonic(), one.place
-                    self._tell_robot(one.place)
+                    self._take_robot(one.place)
                 case CommandChanged() if one.state.command == self._command and self._command is not None:
                     self._handle(tm.GoalTold(one.state.text, one.state.is_final, one.state.is_reached))
                 case ObjectChanged():
@@ -225,8 +222,10 @@ class TrialRunner:
             self._robot = None
             self._handle(tm.RobotSeen(None))
 
-    def _tell_robot(self, place: RobotPlace) -> None:
+    def _take_robot(self, place: RobotPlace) -> None:
         floor = self._floor
+        if self._marker_id is not None:  # the trial has begun, with this robot
+            self._robot_name = place.robot
         self._handle(tm.RobotSeen(None if floor is None else floor.robot(place, self._now_s())))
 
     def _take_object(self, change: ObjectChanged) -> None:

@@ -91,7 +91,8 @@ class MadeUpRoom:
             SPOT_ID: thing(SPOT_ID, ObjectKind.MARKER, STUDY_NAME, at(T.x, T.y), floor.map_id)
         }
 
-    def send_robot(self, floor: StudyFloor, place: tuple[float, float]) -> int:
+    def send_robot(self, floor: StudyFloor, place: tuple[float, float], robot: str | None) -> int:
+        assert robot == "bot"
         T = floor.in_map(*place)
         self.sent.append((round(T.x, 3), round(T.y, 3)))
         self.robot = floor.map_id, T.x, T.y
@@ -229,7 +230,7 @@ def test_the_researcher_ends_the_trial_and_the_robot_stops(bench: RunnerBench) -
         bench.researcher.wants_end = step >= 30
         if step == 20:
             bench.researcher.typed.append("")
-            bench.room.send_robot = lambda floor, place: 5  # type: ignore[method-assign]
+            bench.room.send_robot = lambda *goal: 5  # type: ignore[method-assign]
 
     bench.room.at_step = end
     with pytest.raises(TrialInterruptedError, match="ended by the researcher"):
@@ -299,5 +300,5 @@ def test_no_trial_begins_without_its_floor(bench: RunnerBench) -> None:
     bench.room.at_step = press
     with pytest.raises(TrialInterruptedError, match="before it began"):
         bench.runner.wait_until_ready()
-    assert "without the floor's marker no spot can be shown: place it first" in bench.researcher.lines
+    assert "no spot can be shown without the floor's one marker; see above" in bench.researcher.lines
     assert not bench.log.path.exists()
