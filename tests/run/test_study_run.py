@@ -196,7 +196,7 @@ def test_a_participant_from_plan_to_report(share: Any, address: str) -> None:
     reached = next(
         one for one in json.loads(report.out)["measures"] if one["name"].startswith("reachability")
     )
-    assert [one["mean"] for one in reached["conditions"]] == [100.0, 100.0]
+    assert [one["mean"][0] for one in reached["conditions"]] == [100.0, 100.0]
 
 
 def post(url: str, body: dict[str, Any]) -> None:
