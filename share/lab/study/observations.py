@@ -20,7 +20,13 @@ from share.files.json_file import own_format_errors, read_json_lines
 from share.files.reading import MB, read_errors, read_text
 from share.lab.study.orders import MAX_CONDITIONS, MIN_CONDITIONS
 from share.lab.study.plan import ANSWERS, MAX_PARTICIPANTS, StudyPlan, SuccessRule
-from share.lab.study.trials import TRIAL_MEASURES, TrialRecord, read_trials, trial_measures
+from share.lab.study.trials import (
+    MAX_LINES_BYTES,
+    TRIAL_MEASURES,
+    TrialRecord,
+    read_trials,
+    trial_measures,
+)
 from share.types import F64, I64
 
 _HEAD = ("participant", "condition", "place")
@@ -142,7 +148,8 @@ def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str
     letters = {letter: k for k, letter in enumerate(plan.letters)}
     table = {one.name: np.full((len(people), len(letters)), math.nan) for one in plan.questions}
     choices = {kind: [""] * len(people) for kind in _CHOICES}
-    for number, row in enumerate(read_json_lines(path) if path.exists() else [], 1):
+    rows = read_json_lines(path, MAX_LINES_BYTES) if path.exists() else []
+    for number, row in enumerate(rows, 1):
         where = f"{path}, line {number}"
         with own_format_errors(Path(where)):
             person = row["participant"]

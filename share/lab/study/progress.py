@@ -10,7 +10,7 @@ from typing import Any
 from share.errors import DataError, UsageError
 from share.files.json_file import own_format_errors, read_json_lines
 from share.lab.study.plan import ANSWERS, Participant, StudyPlan
-from share.lab.study.trials import EVENTS, read_trials, trial_folder
+from share.lab.study.trials import EVENTS, MAX_LINES_BYTES, read_trials, trial_folder
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _trial_end(path: Path) -> _TrialEnd:
 
 
 def _read_rows(path: Path) -> list[Mapping[str, Any]]:
-    return list(read_json_lines(path)) if path.exists() else []
+    return list(read_json_lines(path, MAX_LINES_BYTES)) if path.exists() else []
 
 
 def left_goals(step: TrialStep, person: Participant, plan: StudyPlan) -> list[tuple[int, int]]:

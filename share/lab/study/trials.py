@@ -17,10 +17,12 @@ import numpy as np
 
 from share.errors import DataError
 from share.files.json_file import own_format_errors, read_json_lines
+from share.files.reading import MB
 from share.lab.study.plan import TRIALS, StudyPlan, SuccessRule
 from share.robot.settings import CREATE3_SPEED_M_S
 
 EVENTS = "events.jsonl"
+MAX_LINES_BYTES = 20 * MB  # of a trial, or of all answers
 JUDGES = ("mocap", "map")
 _MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
 _NO_STATUS = "none"
@@ -107,7 +109,7 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
     """Read the events of one trial, which must be the planned one. Raises DataError."""
     record = TrialRecord(condition, "", {}, False)
     wanted = {"participant": participant, "place": place, "condition": condition, "plan": plan.digest}
-    for number, event in enumerate(read_json_lines(path), 1):
+    for number, event in enumerate(read_json_lines(path, MAX_LINES_BYTES), 1):
         where = f"{path}, line {number}"
         with own_format_errors(Path(where)):
             kind = event["event"]

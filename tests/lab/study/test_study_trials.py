@@ -175,6 +175,17 @@ def test_wrong_events_are_refused_with_their_line(tmp_path: Path, lines: list[An
         read_trials(tmp_path, PLAN)
 
 
+@pytest.mark.parametrize("name", ["answers.jsonl", f"trials/{P01}-1/events.jsonl"])
+def test_a_file_larger_than_any_trial_is_refused(tmp_path: Path, soon: None, name: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        for _ in range(30):
+            file.write(b'{"event": "moves"}\n' * 50_000)
+    with pytest.raises(DataError, match=f"{path.name}.*MB"):
+        read_study(tmp_path, PLAN, RULE)
+
+
 def test_a_trial_that_is_not_planned_is_refused(tmp_path: Path) -> None:
     write_lines(tmp_path / "trials" / "p99-1" / "events.jsonl", [])
     with pytest.raises(DataError, match="p99-1: the plan has no such trial"):
