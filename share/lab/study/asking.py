@@ -25,6 +25,7 @@ class PageWords:
     round: str = "Round {round}"
     most: str = "Which round did you like most?"
     least: str = "Which round did you like least?"
+    same: str = "The same round cannot be both."
     send: str = "Send"
     incomplete: str = "Not all is answered. Press Send again to leave it so."
     thanks: str = "Thank you."
@@ -46,10 +47,12 @@ class AskedItem:
 
 @dataclass(frozen=True)
 class AskedForm:
-    """What is asked at a time. Answers are values by item; None: not answered."""
+    """What is asked at a time. Answers are values by item; None: not answered. same: what is said if two
+    answers are the same, where they must not be; empty: they may."""
 
     heading: str
     items: tuple[AskedItem, ...]
+    same: str = ""
 
     def checked(self, given: Mapping[str, Any]) -> dict[str, int | None]:
         """Return the answers, one for each item. Raises ValueError that says what is wrong."""
@@ -62,6 +65,8 @@ class AskedForm:
             if value is not None and (type(value) is not int or value not in values):
                 wanted = f"a whole number from {min(values)} to {max(values)}"
                 raise ValueError(f"{one.name}: {value!s:.40} is not {wanted}")
+            if self.same and value is not None and value in answers.values():
+                raise ValueError(self.same)
             answers[one.name] = value
         return answers
 
@@ -85,7 +90,7 @@ def choice_form(words: PageWords, places: list[int]) -> AskedForm:
     """Return what is asked at the end: the best and the worst of the trials at these places."""
     options = tuple((place, words.round.replace("{round}", str(place))) for place in places)
     items = AskedItem(MOST, words.most, options), AskedItem(LEAST, words.least, options)
-    return AskedForm(words.last_heading, items)
+    return AskedForm(words.last_heading, items, words.same)
 
 
 def read_wording(path: Path, plan: StudyPlan) -> tuple[tuple[StudyQuestion, ...], PageWords]:

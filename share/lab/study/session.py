@@ -172,7 +172,11 @@ class StudySession:
     def _ask_here(self, form: AskedForm) -> dict[str, int | None]:
         self._say(form.heading)
         self.researcher.forget_typed()
-        return form.checked({one.name: self._ask_item(form, one) for one in form.items})
+        while True:
+            try:
+                return form.checked({one.name: self._ask_item(form, one) for one in form.items})
+            except ValueError as error:  # of answers that are each well
+                self._say(str(error))
 
     def _ask_item(self, form: AskedForm, item: AskedItem) -> int | None:
         ends = f" ({item.low} … {item.high})" if item.low or item.high else ""

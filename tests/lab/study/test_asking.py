@@ -49,6 +49,9 @@ def test_the_choice_is_among_the_rounds_that_were_carried_through() -> None:
     assert form.items[0].options == ((1, "Round 1"), (3, "Round 3"))
     with pytest.raises(ValueError, match="2 is not"):
         form.checked({"most": 2})
+    with pytest.raises(ValueError, match="The same round cannot be both"):
+        form.checked({"most": 3, "least": 3})
+    assert form.checked({}) == {"most": None, "least": None}
 
 
 @pytest.mark.parametrize("name", ["questions-en.yaml", "questions-de.yaml"])

@@ -120,13 +120,14 @@ def answers(folder: Path) -> list[dict[str, object]]:
 
 def test_questions_at_the_terminal(tmp_path: Path) -> None:
     steps = [AnswerStep(1, "B"), ChoiceStep({1: "B", 3: "A"})]
-    made, researcher = session(tmp_path, "12", "five", "5", "", "3", "2", "1", "end")
+    made, researcher = session(tmp_path, "12", "five", "5", "", "3", "3", "3", "2", "1", "end")
     made.lead(P01, steps)
     assert answers(tmp_path) == [
         {"participant": "p01", "condition": "B", "answers": {"predictability": 5, "responsiveness": None}},
         {"participant": "p01", "most": "A", "least": "B"},
     ]
     assert "'12' is not a whole number from 1 to 10" in researcher.lines
+    assert researcher.lines.count("The same round cannot be both.") == 1
     assert "'five' is not a whole number from 1 to 10" in researcher.lines
 
 
