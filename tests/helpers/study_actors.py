@@ -18,6 +18,7 @@ from helpers.map_changes import ANN, pose, small_map
 
 from share import Room, ShareError
 from share.geometry.se3 import from_rt, so3_exp
+from share.lab.study.floor import SPOT_ID
 from share.mapping.map_changes import MapChange, SaveObject, SaveRun
 from share.net.transport import connect
 from share.protocol.room_events import MessageWanted, RobotCommanded
@@ -81,10 +82,13 @@ class StudyActors:
         for one in self._threads:
             one.join()
 
-    def place_cube(self, x: float, y: float, number: int) -> None:
-        """The wearer places a cube on the floor. Raises ShareError without an edge."""
+    def place_cube(self, x: float, y: float, number: int) -> RoomObject | None:
+        """The wearer places a cube on the floor. Return what shows it the spot. Raises ShareError without an
+        edge."""
         with Room(self.address, "wearer") as room:
+            shown = room.objects.get(SPOT_ID)
             room.put("cube", (*in_map(x, y), 0.1), object_id=number)
+        return shown
 
     def _agent(self, name: str) -> None:
         number, kind = _KINDS[name]

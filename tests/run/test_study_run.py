@@ -15,8 +15,9 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from helpers.study_actors import MARKER, StudyActors, study_map
+from helpers.study_actors import MARKER, StudyActors, in_map, study_map
 
 from share.child_processes import child_environment
 from share.config import POLICY_NAMES
@@ -152,16 +153,18 @@ def test_a_participant_from_plan_to_report(share: Any, address: str) -> None:
                 study.wait(f"spot {spot},")
                 x, y = made.spots[spot - 1]
                 if goal == 2:
-                    actors.place_cube(x + 0.1, y, 5)
+                    shown = actors.place_cube(x + 0.1, y, 5)
+                    assert shown is not None and shown.owner == "study"
+                    np.testing.assert_allclose(shown.T_map_object[:2, 3], in_map(x, y), atol=1e-6)
                 else:
                     study.type()
                 study.wait("reached after")
             study.wait("questions are on the page")
             page = re.findall(r"questions at (http://\S+)", study.said)[-1].rstrip("/")
-            shown = json.loads(urllib.request.urlopen(f"{page}/form.json", timeout=_WAIT_S).read())
-            assert shown["form"]["heading"] == f"After round {place}"
+            asked = json.loads(urllib.request.urlopen(f"{page}/form.json", timeout=_WAIT_S).read())
+            assert asked["form"]["heading"] == f"After round {place}"
             body = {
-                "number": shown["number"],
+                "number": asked["number"],
                 "answers": {"predictability": 3 + place, "responsiveness": None},
             }
             post(f"{page}/answers", body)
