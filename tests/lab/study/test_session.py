@@ -163,3 +163,13 @@ def test_the_edge_with_keys_gives_no_rights_to_all(given: tuple[str, ...], folde
     assert ("--allow" in arguments) == (folder is None)
     assert arguments[-6:] == ["--http", "0", "--blind", "k.json:B", "--out", "out"]
     assert "--http" not in EdgeOptions(("--http", "8080")).complete(Path("k"), "B", Path("o"))[2:-4]
+
+
+def test_an_interrupted_trial_is_asked_about_and_left(tmp_path: Path) -> None:
+    write_trial(tmp_path, 1, 1)
+    _, steps = read_progress(tmp_path, PLAN).choose("p01")
+    made, researcher = session(tmp_path, " Leave ", "2", "3", "end")
+    made.lead(P01, [*steps[:2], steps[-1]])  # of the trials, the first alone
+    assert "p01, trial 1 was interrupted after 1 of its spots: Enter goes on" in researcher.lines[0]
+    assert answers(tmp_path) == [{"participant": "p01", "most": LETTERS[1], "least": LETTERS[2]}]
+    assert read_progress(tmp_path, PLAN).choose("p01")[1][0].place == 2  # type: ignore[union-attr]
