@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import socket
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -171,3 +173,29 @@ def test_others_need_the_token() -> None:
         assert bench.fetch("/")[0] == 401 and bench.fetch("/form.json")[0] == 401
         assert bench.fetch("/answers", {"number": 1, "answers": {}})[0] == 401
         assert bench.fetch("/form.json", Authorization=f"Bearer {'t' * 20}")[0] == 200
+
+
+def sent_raw(page: QuestionPage, *pieces: bytes) -> bytes:
+    host, _, port = page.endpoint.rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=20) as client:
+        for piece in pieces:
+            client.sendall(piece)
+            time.sleep(0.05)
+        client.shutdown(socket.SHUT_WR)
+        return client.recv(12)
+
+
+def test_a_body_may_come_in_pieces_and_ends_where_it_says(bench: PageBench) -> None:
+    bench.page.ask(FORM)
+    body = json.dumps({"number": 1, "answers": {"predictability": 4}}).encode()
+    head = (
+        f"POST /answers HTTP/1.1\r\nOrigin: http://{bench.page.endpoint}\r\nHost: {bench.page.endpoint}\r\n"
+    )
+    first = f"{head}Content-Length: {len(body)}\r\n".encode()
+    assert sent_raw(bench.page, first, b"\r\n", body[:10], body[10:]) == b"HTTP/1.1 200"
+    assert bench.page.answers() == {"predictability": 4, "responsiveness": None}
+    bench.page.ask(FORM)
+    for length in ("99999999999", "-1", "x", ""):
+        answer = sent_raw(bench.page, f"{head}Content-Length: {length}\r\n\r\n".encode(), b"y" * 9000)
+        assert answer in (b"HTTP/1.1 431", b"HTTP/1.1 400", b"")
+    assert bench.page.answers() is None and bench.fetch("/")[0] == 200
