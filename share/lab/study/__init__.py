@@ -11,7 +11,7 @@
       floor           the plan's floor in the shared map, by a marker
       readiness       whether all is well for a trial
       study_room      the edge of a trial, started by letter, and a client of it
-      event_log       lines that a power cut does not take
+      study_log       lines that a power cut does not take
       asking          questions and answers; question_page serves them
     trials          what a trial leaves behind, and whether the robot came
     observations    the table that is analysed, from trials or from a CSV file

@@ -11,10 +11,10 @@ from typing import Any
 from share.errors import UsageError
 from share.lab.study import trial_machine as tm
 from share.lab.study.asking import LEAST, MOST, AskedForm, AskedItem, PageWords, choice_form, trial_form
-from share.lab.study.event_log import EventLog
 from share.lab.study.plan import ANSWERS, Participant, StudyPlan, StudyQuestion
 from share.lab.study.progress import AnswerStep, ChoiceStep, StudyStep, TrialStep, left_goals
 from share.lab.study.question_page import QuestionPage
+from share.lab.study.study_log import StudyLog
 from share.lab.study.study_room import EdgeOptions, StudyRoom
 from share.lab.study.trial_runner import Researcher, TrialHeader, TrialInterruptedError, TrialRunner
 from share.lab.study.trials import EVENTS, trial_folder
@@ -75,7 +75,7 @@ class StudySession:
             f"{len(goals)} of {total} spots; success is within {self.plan.success.distance_m:g} m in "
             f"{self.plan.success.timeout_s:g} s, judged by the shared map"
         )
-        log = EventLog(folder / EVENTS)
+        log = StudyLog(folder / EVENTS)
         fields = {
             "participant": person.name,
             "place": step.place,
@@ -110,7 +110,7 @@ class StudySession:
         return LEAVE if self._typed().strip().lower() == LEAVE else GO_ON
 
     def _leave(self, person: Participant, step: TrialStep) -> None:
-        log = EventLog(trial_folder(self.folder, person.name, step.place) / EVENTS)
+        log = StudyLog(trial_folder(self.folder, person.name, step.place) / EVENTS)
         line = {
             "event": "interrupted",
             "t_s": step.last_s,
@@ -145,7 +145,7 @@ class StudySession:
         self._append_answers(row)
 
     def _append_answers(self, row: Mapping[str, Any]) -> None:
-        log = EventLog(self.folder / ANSWERS)
+        log = StudyLog(self.folder / ANSWERS)
         try:
             log.append(row)
         finally:

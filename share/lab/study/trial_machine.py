@@ -43,7 +43,7 @@ class CalledSpot:
 
 
 @dataclass(frozen=True)
-class RobotSeen:
+class RobotPlaced:
     """Where the robot is; None: not known on the floor."""
 
     sample: RobotSample | None
@@ -82,7 +82,7 @@ class TimePassed:
     pass
 
 
-TrialEvent = RobotSeen | CubeSeen | CallPressed | GoalTold | TrialBroken | TimePassed
+TrialEvent = RobotPlaced | CubeSeen | CallPressed | GoalTold | TrialBroken | TimePassed
 
 # ---------------------------------------------------------------- effects
 
@@ -173,7 +173,7 @@ class TrialMachine:
             return []
         self._effects, self._now_s = [], now_s
         match event:
-            case RobotSeen():
+            case RobotPlaced():
                 self._on_robot(event.sample)
             case CubeSeen():
                 self._on_cube(event.place)

@@ -11,9 +11,9 @@ from typing import Any, Protocol
 
 from share.errors import ShareError
 from share.lab.study import trial_machine as tm
-from share.lab.study.event_log import EventLog, free_bytes
 from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor, find_markers, floor_of
 from share.lab.study.readiness import Readiness, RoomState, check_room
+from share.lab.study.study_log import StudyLog, free_bytes
 from share.lab.study.study_room import StudyRoom
 from share.protocol.room_events import CommandChanged, ObjectChanged, RobotSeen
 from share.wire.room_messages import ObjectKind, RobotPlace, RoomObject
@@ -60,7 +60,7 @@ class TrialRunner:
     """Carries out one trial in a room. Raises TrialInterruptedError where it ends early."""
 
     def __init__(
-        self, room: StudyRoom, log: EventLog, researcher: Researcher, machine: tm.TrialMachine
+        self, room: StudyRoom, log: StudyLog, researcher: Researcher, machine: tm.TrialMachine
     ) -> None:
         self._room, self._log, self._researcher, self._machine = room, log, researcher, machine
         self._robot: tuple[float, RobotPlace] | None = None  # when it came
@@ -220,13 +220,13 @@ class TrialRunner:
                     self._take_object(one)
         if self._robot is not None and time.monotonic() - self._robot[0] > _GONE_S:
             self._robot = None
-            self._handle(tm.RobotSeen(None))
+            self._handle(tm.RobotPlaced(None))
 
     def _take_robot(self, place: RobotPlace) -> None:
         floor = self._floor
         if self._marker_id is not None:  # the trial has begun, with this robot
             self._robot_name = place.robot
-        self._handle(tm.RobotSeen(None if floor is None else floor.robot(place, self._now_s())))
+        self._handle(tm.RobotPlaced(None if floor is None else floor.robot(place, self._now_s())))
 
     def _take_object(self, change: ObjectChanged) -> None:
         one = change.changed

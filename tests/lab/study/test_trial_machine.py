@@ -35,7 +35,7 @@ class TrialBench:
         for _ in range(round(seconds * HZ)):
             self.now_s += 1 / HZ
             sample = None if self.at is None else RobotSample(self.now_s, *self.at, 0.0)
-            self.do(tm.RobotSeen(sample))
+            self.do(tm.RobotPlaced(sample))
             self.do(tm.TimePassed())
 
     def drive(self, x: float, y: float, seconds: float) -> None:

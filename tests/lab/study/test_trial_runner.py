@@ -18,9 +18,9 @@ import pytest
 from share.errors import ShareError
 from share.geometry.se3 import from_rt, so3_exp
 from share.lab.study import trial_machine as tm
-from share.lab.study.event_log import EventLog
 from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor
 from share.lab.study.plan import SuccessRule
+from share.lab.study.study_log import StudyLog
 from share.lab.study.trial_runner import TrialHeader, TrialInterruptedError, TrialRunner
 from share.protocol.room_events import ClientEffect, CommandChanged, ObjectChanged, RobotSeen
 from share.types import F64
@@ -128,7 +128,7 @@ class RunnerBench:
     def __post_init__(self) -> None:
         self.room = MadeUpRoom(self.clock, {MARKER: thing(MARKER, ObjectKind.MARKER, "lead", at(0.0, 0.0))})
         self.researcher = MadeUpResearcher()
-        self.log = EventLog(self.folder / "events.jsonl")
+        self.log = StudyLog(self.folder / "events.jsonl")
         machine = tm.TrialMachine(SPOTS, 2, SuccessRule())
         self.runner = TrialRunner(self.room, self.log, self.researcher, machine)  # type: ignore[arg-type]
 

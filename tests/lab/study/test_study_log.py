@@ -13,7 +13,7 @@ from helpers.study_folder import begin, goal_events, small_plan
 
 from share.errors import ShareError
 from share.files.json_file import read_json_lines
-from share.lab.study.event_log import EventLog, free_bytes
+from share.lab.study.study_log import StudyLog, free_bytes
 from share.lab.study.trials import read_trials, trial_folder
 
 PLAN, _ = small_plan()
@@ -22,7 +22,7 @@ LINES = [begin(PLAN, P01, 1), *goal_events(1, 1, 8.0, 10.0)]
 
 
 def written(path: Path, lines: list[dict[str, Any]]) -> None:
-    log = EventLog(path)
+    log = StudyLog(path)
     for line in lines:
         log.append(line)
     log.close()
@@ -36,7 +36,7 @@ def test_a_power_cut_at_any_byte_costs_the_last_line_at_most(tmp_path: Path) -> 
     for cut in range(1, len(data) + 1):
         path.write_bytes(data[:cut])
         whole = data[:cut].count(b"\n")
-        log = EventLog(path)
+        log = StudyLog(path)
         log.append(second if whole else LINES[0])
         log.close()
         assert log.was_torn == (not data[:cut].endswith(b"\n"))
@@ -54,7 +54,7 @@ def test_a_line_longer_than_a_block_is_found_torn(tmp_path: Path) -> None:
 @pytest.mark.parametrize("taken", [0, 7])
 def test_a_full_disk_leaves_no_half_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, taken: int) -> None:
     path = tmp_path / "a.jsonl"
-    log = EventLog(path)
+    log = StudyLog(path)
     log.append({"a": 1})
     real, calls = os.write, []
 
@@ -83,7 +83,7 @@ def test_a_line_is_synced_before_append_returns(tmp_path: Path, monkeypatch: pyt
         real(handle)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    log = EventLog(tmp_path / "new" / "a.jsonl")
+    log = StudyLog(tmp_path / "new" / "a.jsonl")
     for k in range(3):
         log.append({"k": k})
         assert [json.loads(line)["k"] for line in synced[-1].splitlines()] == list(range(k + 1))
@@ -93,7 +93,7 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "target").write_text("")
     (tmp_path / "a.jsonl").symlink_to(tmp_path / "target")
     with pytest.raises(ShareError, match="cannot be written"):
-        EventLog(tmp_path / "a.jsonl").append({"a": 1})
+        StudyLog(tmp_path / "a.jsonl").append({"a": 1})
     assert (tmp_path / "target").read_text() == ""
 
 

@@ -17,7 +17,7 @@ from share.errors import ShareError
 from share.files.writing import sync_folder, write_errors
 
 
-class EventLog:
+class StudyLog:
     """Appends to `path`, which is made with its folder by the first line. was_torn: an incomplete last line
     was taken away."""
 
