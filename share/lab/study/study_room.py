@@ -149,6 +149,11 @@ class StudyRoom:
     def objects(self) -> dict[int, RoomObject]:
         return self._link.client.objects
 
+    @property
+    def knows_objects(self) -> bool:
+        """Whether all objects of the room have come."""
+        return self._link.client.has_all_objects
+
     def step(self, timeout_ms: int) -> list[ClientEffect]:
         """Wait for news of the room for at most this time. Raises ShareError if the edge refuses us."""
         self.show_log()

@@ -52,6 +52,7 @@ class MadeUpRoom:
     stops: int = 0
     gone: str | None = None
     is_idle: bool = True
+    knows_objects: bool = True
     robot: tuple[str, float, float] = (MAP, 4.0, 4.0)
     queue: list[ClientEffect] = field(default_factory=list)
     at_step: Callable[[int], None] = lambda step: None
