@@ -204,7 +204,8 @@ def test_examples_use_options_that_exist(page: Path) -> None:
     text = page.read_text().replace("\\\n", " ")
     code = "\n".join(re.findall(r"^```\w+\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL))
     for line in re.findall(r"^(?:\w*\$ )?(share (?!\w+: ).+)$", code, flags=re.MULTILINE):
-        line = re.split(r"\s{2,}#|\s&", line)[0]
+        line, _, of_edge = re.split(r"\s{2,}#|\s&", line)[0].partition(" -- ")
+        assert not set(re.findall(r"--[a-z-]+", of_edge)) - options(known["share edge"]), line
         name = max((n for n in known if f"{line} ".startswith(f"{n} ")), key=len, default=None)
         assert name or re.match(r"share (--|[a-z]+ --help)", line), f"{page.name}: {line}"
         if name:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from share.cli import options
+from share.cli.blind_edge import condition_text, edge_settings
 from share.config import STREAMED
 from share.errors import UsageError
 from share.event_kinds import EventKind
@@ -32,6 +33,11 @@ if TYPE_CHECKING:
 @click.command()
 @click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
 @options.policy
+@click.option(
+    "--blind",
+    metavar="KEY:LETTER",
+    help="The policy of this letter by the key of a study (`share study plan`), shown as the letter.",
+)
 @options.keys
 @click.option(
     "--map",
@@ -85,6 +91,7 @@ if TYPE_CHECKING:
 def edge(
     bind: str,
     policy: str | None,
+    blind: str | None,
     keys: Path | None,
     map_file: Path | None,
     http: str | None,
@@ -110,7 +117,7 @@ def edge(
     \b
     Example:  share edge --bind tcp://127.0.0.1:5555 --map room.sqlite --http 8080 --view 8081
     """
-    settings = options.load_config(config_file, [policy])
+    settings, blinding = edge_settings(config_file, policy, blind)
     from contextlib import ExitStack, closing
 
     from share.cli.stderr import Stderr
@@ -124,6 +131,8 @@ def edge(
     edge_key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
     allowed = allowed_without_keys(allow, edge_key_pair is not None)
     is_streamed = settings.edge.policy == STREAMED
+    if is_streamed and blinding is not None:
+        raise UsageError(f"--blind: condition {blinding.label} builds no map, so no robot drives by it")
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
     served = _PageOptions(http, view, headset, headset_cert, headset_key, mounts, http_token, out)
@@ -137,10 +146,10 @@ def edge(
         pages = _EdgePages(stack, stderr, served, token, access)
         store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
         on_event = partial(_print_event, stderr, verbose)
-        run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed)
+        run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed, blinding)
         pages.run = stack.enter_context(closing(run))
         with stop_on_signal(run.stop):
-            stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}")
+            stderr.print_line(f"listening on {link.endpoint}, {condition_text(settings, blinding)}")
             _print_keys(stderr, edge_key_pair)
             if allowed:
                 stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")

@@ -356,8 +356,8 @@ def cancel(**robot_options: Any) -> None:
 @_over_wire
 @options.as_json
 def watch(as_json: bool, **robot_options: Any) -> None:
-    """Show where the robot is and what it does, twice a second, until Ctrl-C. With --json, a line of JSON
-    each time.
+    """Show where the robot is and what it does, twice a second, until Ctrl-C; over an edge five times while
+    it drives. With --json, a line of JSON each time.
 
     \b
     Example:  share robot watch

@@ -1,4 +1,4 @@
-"""`share study`: plan a study with people by letters, unblind it at its end, analyse it."""
+"""`share study`: plan a study with people by letters, lead it, unblind it at its end, analyse it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
+from share.cli.study_run import run
 from share.cli.terminal import print_note
-from share.config import POLICY_NAMES
+from share.config import POLICY_NAMES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -27,10 +28,11 @@ if TYPE_CHECKING:
 
 @click.group(cls=CommandGroup, prefix="study ")
 def study() -> None:
-    """Plan a blind study with people, unblind it at its end, and analyse it.
+    """Plan a blind study with people, lead its participants, unblind it at its end, and analyse it.
 
     \b
     Example:  share study plan --participants 20 --out study
+              share study run study
               share study analyze study --out first-look
               share study unblind study --key study-key.json
               share study analyze study --out report
@@ -63,7 +65,7 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     "--policy",
     "policies",
     multiple=True,
-    type=click.Choice(POLICY_NAMES),
+    type=click.Choice([name for name in POLICY_NAMES if name != STREAMED]),  # that builds no map
     help="A condition; 2 to 8 of them.  [default: the paper's: share, covins-g, linear, equal]",
 )
 @click.option(
@@ -183,6 +185,9 @@ def _write_plan(plan_path: Path, key_path: Path, plan: StudyPlan, key_text: str)
     except BaseException:
         key_path.unlink(missing_ok=True)  # ours, of a plan that does not exist
         raise
+
+
+study.add_command(run)
 
 
 @study.command(short_help="Tell the policies behind the letters, once all trials are done.")

@@ -20,13 +20,13 @@ def read_json(path: Path) -> dict[str, Any]:
     return _parse_object(text, str(path))
 
 
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
+def read_json_lines(path: Path, max_bytes: int = MAX_EVENTS_BYTES) -> list[dict[str, Any]]:
     """Read a file with one JSON object per line, without an incomplete last line (still being written).
 
     Raises DataError that names file and line.
     """
     with read_errors(path):
-        text = read_text(path, MAX_EVENTS_BYTES)
+        text = read_text(path, max_bytes)
     complete = text[: text.rfind("\n") + 1].splitlines()
     return [_parse_object(line, f"{path}, line {number}") for number, line in enumerate(complete, 1)]
 

@@ -99,7 +99,7 @@ class HeadsetPage(ServedPage):
         listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
-        shown = str(Address(_shown_host(bound.host), bound.port)).removeprefix("tcp://")
+        shown = str(Address(shown_host(bound.host), bound.port)).removeprefix("tcp://")
         self.url = f"{self.scheme}://{shown}/"
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
@@ -143,7 +143,7 @@ class HeadsetPage(ServedPage):
                 self._report = {key: value for key, value in fields.items() if key != "line"}
 
 
-def _shown_host(host: str) -> str:
+def shown_host(host: str) -> str:
     """Return the host under which a headset reaches what is bound at `host`."""
     far_away = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # of no machine: RFC 5737, RFC 3849
     if host not in far_away:

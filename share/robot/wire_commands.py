@@ -21,7 +21,7 @@ from share.wire.room_messages import (
 LEASE_S = 3.0  # a goal that is not repeated for so long is given up: commander, edge or network are gone
 _MAX_KNOWN = 64  # commands; the oldest final one is forgotten
 _PROGRESS_S = 0.25  # between two reports on the way
-_PLACE_S = 0.5
+_PLACE_S, _DRIVEN_PLACE_S = 0.5, 0.2  # between two places; while a goal is under way
 
 
 @dataclass
@@ -47,7 +47,8 @@ class WireCommands:
 
     def __init__(self) -> None:
         self._known: dict[tuple[type, str, int], BridgeCommand] = {}
-        self._progress_timer, self._place_timer = PeriodicTimer(_PROGRESS_S), PeriodicTimer(_PLACE_S)
+        self._progress_timer = PeriodicTimer(_PROGRESS_S)
+        self._place_ns: int | None = None  # when the last place was told
 
     def take(
         self, command: Goto | Cancel, make_goal_id: Callable[[], bytes], now_ns: int
@@ -126,8 +127,15 @@ class WireCommands:
         return events, [known.state for known in held]
 
     def due_place(self, report: Callable[[], dict[str, Any]], now_ns: int) -> RobotPlace | None:
-        """Return where the robot is, twice a second. report: of the bridge."""
-        return robot_place(report()) if self._place_timer.fire_if_due(now_ns) else None
+        """Return where the robot is, twice a second, five times with a goal. report: of the bridge."""
+        since_ns = None if self._place_ns is None else now_ns - self._place_ns
+        if since_ns is not None and since_ns < seconds_to_ns(_DRIVEN_PLACE_S):
+            return None
+        state = report()
+        if since_ns is not None and since_ns < seconds_to_ns(_PLACE_S) and state["goal"] is None:
+            return None
+        self._place_ns = now_ns
+        return robot_place(state)
 
     def _make_room(self) -> bool:
         """Forget one of too many commands: the oldest final one, else one that never began, else a

@@ -50,6 +50,7 @@ from share.protocol.edge_events import (
 from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
+from share.runtime.blinding import Blinding
 from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
@@ -90,7 +91,7 @@ class _MapperDied:
 
 class EdgeRun:
     """One run of the edge, until `stop`. Writes events.jsonl as events happen and edge.json at the end to
-    `out`. allowed: what every client may do where no keys say it."""
+    `out`. allowed: what every client may do where no keys say it. blinding: of a study."""
 
     def __init__(
         self,
@@ -101,8 +102,9 @@ class EdgeRun:
         store: MapStore | None = None,
         observers: Sequence[EdgeObserver] = (),
         allowed: Collection[Permission] = (),
+        blinding: Blinding | None = None,
     ) -> None:
-        self._allowed = frozenset(allowed)
+        self._allowed, self._blinding = frozenset(allowed), blinding
         self._settings, self._link, self._on_record = settings, link, on_record
         self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
@@ -187,6 +189,8 @@ class EdgeRun:
         map_trouble = None if self._map_writer is None else self._map_writer.trouble
         current = (map_trouble, self._files.trouble, self._progress.stall(), self._link.trouble())
         report = self._totals.with_totals(self._state_machine.report(self._progress.report))
+        if self._blinding is not None:
+            report = self._blinding.covered(report)
         self._report = {
             **report,
             "refused": [*self._other_troubles.current(), *report["refused"]],

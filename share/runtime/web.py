@@ -1,7 +1,8 @@
 """A small single-threaded HTTP server for few clients, which cannot hold up the process that it runs in.
 
-A connection carries one GET or HEAD request without a body, and its response (RFC 9110, 9112). The thread
-uses at most a fifth of a core whatever clients do: it sleeps four times as long as it has worked.
+A connection carries one GET or HEAD request without a body, or where it is wanted a small POST, and its
+response (RFC 9110, 9112). The thread uses at most a fifth of a core whatever clients do: it sleeps four times
+as long as it has worked.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _LINGER_S = 1.0  # input is read so long after the response; a reset would destr
 _MAX_SLEEP_S = 0.1  # after work, and when no socket is left
 _SLEEP_RATIO = 4.0  # sleep per CPU time
 
+_READS = ("GET", "HEAD")
 _REQUEST = re.compile(r"([A-Z]+) (\S+) HTTP/1\.[01]")
 _HEADERS = (
     "Cache-Control: no-store",
@@ -48,7 +50,7 @@ class Response:
 
     def encode(self, with_body: bool) -> bytes:
         """Return the bytes on the wire."""
-        allow = ["Allow: GET, HEAD"] if self.status is HTTPStatus.METHOD_NOT_ALLOWED else []
+        allow = [f"Allow: {', '.join(_READS)}"] if self.status is HTTPStatus.METHOD_NOT_ALLOWED else []
         head = [
             f"HTTP/1.1 {self.status.value} {self.status.phrase}",
             f"Date: {formatdate(usegmt=True)}",
@@ -68,15 +70,23 @@ def text_response(status: HTTPStatus, text: str, headers: tuple[str, ...] = ()) 
 
 class WebServer:
     """Listens on HOST:PORT, or on PORT of this machine alone; port 0 takes a free one. `handler` is called
-    with a path, from the server's thread, and must not raise. token: see `HttpGuard`.
+    with a path, from the server's thread, and must not raise. token: see `HttpGuard`. on_post: the same with
+    the body of a POST from a page of this server; None: there are none. option: that gives the address.
 
     Raises UsageError for a malformed address, or one that others reach without a token; TransportError if it
     cannot be bound.
     """
 
-    def __init__(self, address: str, handler: Callable[[str], Response], token: str | None = None) -> None:
-        self._handler = handler
-        self._listener, bound = listen(http_address("--http", address, token))
+    def __init__(
+        self,
+        address: str,
+        handler: Callable[[str], Response],
+        token: str | None = None,
+        on_post: Callable[[str, bytes], Response] | None = None,
+        option: str = "--http",
+    ) -> None:
+        self._handler, self._on_post = handler, on_post
+        self._listener, bound = listen(http_address(option, address, token))
         self._guard = HttpGuard(bound, token)
         self._wake_sender, self._wake_receiver = socket.socketpair()
         self._selector = selectors.DefaultSelector()
@@ -159,16 +169,25 @@ class WebServer:
         if len(request) > MAX_REQUEST_BYTES:
             text = f"the request is larger than {MAX_REQUEST_BYTES} bytes"
             return text_response(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, text).encode(True)
-        first, _, rest = request.decode("latin-1").replace("\r\n", "\n").partition("\n")
+        head, body = _parts(request)
+        first, _, rest = head.partition("\n")
         match = _REQUEST.fullmatch(first)
         if match is None:
             return text_response(HTTPStatus.BAD_REQUEST, "not an HTTP/1.1 request").encode(True)
         method, path = match[1], match[2].partition("?")[0]
-        refusal = self._guard.check(match[2], _header_fields(rest))
-        if method not in ("GET", "HEAD"):
+        fields = _header_fields(rest)
+        refusal = self._guard.check(match[2], fields)
+        on_post = self._on_post if method == "POST" else None
+        if method not in _READS and on_post is None:
             response = text_response(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD are allowed")
         elif refusal is not None:
             response = text_response(refusal.status, refusal.text, refusal.headers)
+        elif (
+            on_post is not None and "origin" not in fields
+        ):  # browsers send it; by it other pages are refused
+            response = text_response(HTTPStatus.FORBIDDEN, "only the page of this server may send")
+        elif on_post is not None:
+            response = on_post(path, body)
         else:
             response = self._handler(path)
         return response.encode(method != "HEAD")
@@ -202,11 +221,27 @@ class _HttpConnection:
         self._request += received
         if not received:
             return 0
-        if not re.search(rb"\n\r?\n", self._request) and len(self._request) <= MAX_REQUEST_BYTES:
+        if not _is_whole(bytes(self._request)) and len(self._request) <= MAX_REQUEST_BYTES:
             return selectors.EVENT_READ
         self._response = memoryview(respond(bytes(self._request)))
         self.deadline = time.monotonic() + CLIENT_TIMEOUT_S
         return selectors.EVENT_WRITE
+
+
+def _parts(request: bytes) -> tuple[str, bytes]:
+    """Return the head of a request, whose lines end by newlines, and its body."""
+    end = re.search(rb"\n\r?\n", request)
+    head, body = (request, b"") if end is None else (request[: end.start() + 1], request[end.end() :])
+    return head.decode("latin-1").replace("\r\n", "\n"), body
+
+
+def _is_whole(request: bytes) -> bool:
+    """Return whether all of a request has come: its head, and as much of a body as that says."""
+    if re.search(rb"\n\r?\n", request) is None:
+        return False
+    head, body = _parts(request)
+    length = _header_fields(head.partition("\n")[2]).get("content-length", "")
+    return not head.startswith("POST ") or not length.isdecimal() or len(body) >= int(length[:9])
 
 
 def _header_fields(text: str) -> dict[str, str]:

@@ -212,8 +212,8 @@ class CommandState:
 
 @dataclass(frozen=True)
 class RobotPlace:
-    """Where a robot is, twice a second: x, y (m), yaw (rad); map_id None: not known. robot: filled in by the
-    edge. text: what it does, or why it takes no goals."""
+    """Where a robot is, twice a second, five times with a goal: x, y (m), yaw (rad); map_id None: not known.
+    robot: filled in by the edge. text: what it does, or why it takes no goals."""
 
     robot: str | None
     map_id: str | None

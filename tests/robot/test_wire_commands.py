@@ -144,6 +144,24 @@ def test_a_goal_goes_to_the_robot_once_and_its_result_comes_back(robot) -> None:
     assert robot.bench.reasons("robot answered") == ["robot 'bot', sent by 'ann': reached"]
 
 
+def test_its_place_comes_twice_a_second_and_five_times_with_a_goal(robot) -> None:
+    ann = robot.bench.client("ann", 31, wants_robots=True)
+    robot.run(0.5)
+
+    def places(seconds: float) -> int:
+        before = len(robot.bench.of(ann, ce.RobotSeen))
+        robot.run(seconds)
+        return len(robot.bench.of(ann, ce.RobotSeen)) - before
+
+    assert places(5) in (9, 10)
+    robot.goto(ann, 1)
+    robot.run(1)
+    assert places(5) in (24, 25)
+    robot.arrive()
+    robot.run(1)
+    assert places(5) in (9, 10)
+
+
 def test_who_may_not_command_gets_one_line_and_nothing_moves() -> None:
     robot = WiredRobot(RoomBench(rights={"eve": frozenset({Permission.OBJECTS})}))
     eve = robot.commander("eve", 32)
@@ -351,7 +369,7 @@ def test_those_that_want_robots_see_where_it_is_and_what_becomes_of_goals(robot)
     robot.goto(ann, 1)
     robot.run(2)
     places = [one.place for one in robot.bench.of(watcher, ce.RobotSeen)]
-    assert 3 <= len(places) <= 5 and places[-1].robot == "bot" and places[-1].map_id == MAP
+    assert 9 <= len(places) <= 11 and places[-1].robot == "bot" and places[-1].map_id == MAP
     assert places[-1].text == "to x 2.00 y -1.00 m for 'ann': executing"
     assert {one.state.commander for one in robot.bench.of(watcher, ce.CommandChanged)} == {"ann"}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,14 +17,22 @@ import numpy as np
 from share.config import POLICY_NAMES
 from share.errors import DataError
 from share.files.json_file import own_format_errors, read_json_lines
-from share.files.reading import MAX_REPORT_BYTES, read_errors, read_text
+from share.files.reading import MB, read_errors, read_text
 from share.lab.study.orders import MAX_CONDITIONS, MIN_CONDITIONS
 from share.lab.study.plan import ANSWERS, MAX_PARTICIPANTS, StudyPlan, SuccessRule
-from share.lab.study.trials import TRIAL_MEASURES, read_trials, trial_measures
+from share.lab.study.trials import (
+    MAX_LINES_BYTES,
+    TRIAL_MEASURES,
+    TrialRecord,
+    read_trials,
+    trial_measures,
+)
 from share.types import F64, I64
 
 _HEAD = ("participant", "condition", "place")
+REPEATED_CALLS = "calls repeated"  # a measure where there are any: they may come of a condition
 _CHOICES = ("most", "least")
+_MAX_CSV_BYTES, _MAX_CSV_LINES, _MAX_MEASURES = 10 * MB, MAX_PARTICIPANTS * MAX_CONDITIONS + 1, 100
 Ranges = Mapping[str, tuple[float, float]]
 
 
@@ -68,18 +77,23 @@ def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
     records = read_trials(study, plan)
     statuses: Counter[str] = Counter()
     repeated: Counter[int] = Counter()
+    recalled = np.full(shape, math.nan)
     for (name, place), record in records.items():
         cell = people.index(name), plan.letters.index(record.condition)
         places[cell] = place
         if record.is_complete:
             statuses.update(goal.status for goal in record.goals.values())
             repeated.update(record.repeated)
+            recalled[cell] = record.repeated.total()
             for measure, value in trial_measures(record.goals.values(), rule).items():
                 measures[measure][cell] = value
+    if repeated:
+        measures[REPEATED_CALLS] = recalled
     answers, choices = _read_answers(study / ANSWERS, plan)
-    judges = sorted({record.judge for record in records.values()})
+    judges = Counter(record.judge for record in records.values())
+    far = _far_cubes(records.values(), plan, rule)
     done = sum(record.is_complete for record in records.values())
-    notes = (*_broken_note(records), *_repeated_note(repeated), *_judge_notes(judges, statuses))
+    notes = (*_broken_note(records), *_repeated_note(repeated), *far, *_judge_notes(judges, statuses))
     return Observations(
         tuple(people), plan.letters, measures | answers, places, choices, notes, places.size, done
     )
@@ -100,7 +114,23 @@ def _repeated_note(repeated: Mapping[int, int]) -> Iterable[str]:
         )
 
 
-def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable[str]:
+def _far_cubes(records: Iterable[TrialRecord], plan: StudyPlan, rule: SuccessRule) -> Iterable[str]:
+    """Say which cubes lay further from their planned spot than a robot may from a cube."""
+    goals = [goal for record in records if record.is_complete for goal in record.goals.values()]
+    far = [(math.dist(goal.cube, plan.spots[goal.spot - 1]), goal.spot) for goal in goals]
+    far = [one for one in far if one[0] > rule.distance_m]
+    if far:
+        distance_m, spot = max(far)
+        yield (
+            f"{len(far)} of {len(goals)} cubes lay more than {rule.distance_m:g} m from their planned spot, "
+            f"the farthest {distance_m:.2f} m from spot {spot}; the robot was sent to the cube"
+        )
+
+
+def _judge_notes(judges: Mapping[str, int], statuses: Mapping[str, int]) -> Iterable[str]:
+    if len(judges) > 1:
+        counts = " and ".join(f"{judges[name]} by {name}" for name in sorted(judges))
+        yield f"THE JUDGE CHANGES within the study: trials are judged {counts}; they do not compare"
     if "map" in judges:
         yield (
             "reachability is judged by the map itself (no motion capture), which favours policies under "
@@ -118,7 +148,8 @@ def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str
     letters = {letter: k for k, letter in enumerate(plan.letters)}
     table = {one.name: np.full((len(people), len(letters)), math.nan) for one in plan.questions}
     choices = {kind: [""] * len(people) for kind in _CHOICES}
-    for number, row in enumerate(read_json_lines(path) if path.exists() else [], 1):
+    rows = read_json_lines(path, MAX_LINES_BYTES) if path.exists() else []
+    for number, row in enumerate(rows, 1):
         where = f"{path}, line {number}"
         with own_format_errors(Path(where)):
             person = row["participant"]
@@ -133,7 +164,7 @@ def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str
                     where,
                 )
             for kind in _CHOICES:
-                if kind in row:
+                if row.get(kind) is not None:
                     if choices[kind][people[person]]:
                         raise DataError(f"{where}: {person} has said before which is {kind} preferred")
                     choices[kind][people[person]] = _known_letter(row[kind], letters, where)
@@ -172,7 +203,10 @@ def read_table(path: Path, ranges: Ranges, choices_file: Path | None) -> Observa
     An empty cell is missing. Raises DataError that names the line.
     """
     lines = _csv_lines(path)
-    head = [name.strip() for name in lines[0][1]]
+    head = [_composed(name) for name in lines[0][1]]
+    ranges = {_composed(name): limits for name, limits in ranges.items()}
+    if len(head) > len(_HEAD) + _MAX_MEASURES:
+        raise DataError(f"{path}: has {len(head) - len(_HEAD)} measures; at most {_MAX_MEASURES} are read")
     is_named = all(name and name.isprintable() for name in head)
     if tuple(head[:3]) != _HEAD or len(head) < 4 or len(set(head)) < len(head) or not is_named:
         raise DataError(
@@ -209,10 +243,15 @@ def read_table(path: Path, ranges: Ranges, choices_file: Path | None) -> Observa
 def _csv_lines(path: Path) -> list[tuple[int, list[str]]]:
     """Return the lines that are not empty, with their numbers; at least two."""
     with read_errors(path):
-        text = read_text(path, MAX_REPORT_BYTES, "utf-8-sig")
+        text = read_text(path, _MAX_CSV_BYTES, "utf-8-sig")
+    lines: list[tuple[int, list[str]]] = []
     try:
         reader = csv.reader(io.StringIO(text), strict=True)
-        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                lines.append((reader.line_num, row))
+            if len(lines) > _MAX_CSV_LINES:
+                raise DataError(f"{path}: has over {_MAX_CSV_LINES} lines, more than any study")
     except csv.Error as error:
         raise DataError(f"{path}: is not CSV: {error}") from None
     if len(lines) < 2:
@@ -232,7 +271,7 @@ class _CsvRow:
     def read(where: str, head: Sequence[str], cells: Sequence[str]) -> _CsvRow:
         if len(cells) != len(head):
             raise DataError(f"{where}: {len(cells)} cells; {len(head)} are wanted")
-        participant, condition, place, *values = (cell.strip() for cell in cells)
+        participant, condition, place, *values = map(_composed, cells)
         if not all(name and name.isprintable() for name in (participant, condition)):
             raise DataError(f"{where}: participant or condition is empty, or not printable")
         if place and not place.isdecimal():
@@ -258,6 +297,11 @@ class _CsvRow:
                 raise DataError(f"{self.where}: {name} {self.values[name]:g} is outside {low:g} to {high:g}")
 
 
+def _composed(cell: str) -> str:
+    """Return a cell in Unicode form NFC: of two files that name a person, one may be decomposed."""
+    return unicodedata.normalize("NFC", cell.strip())
+
+
 def _number(cell: str, name: str, where: str) -> float:
     if not cell:
         return math.nan
@@ -280,7 +324,7 @@ def _read_choices(path: Path, people: Sequence[str], conditions: Sequence[str]) 
     chosen: dict[str, Sequence[str]] = {}
     for number, cells in lines[1:]:
         where = f"{path}, line {number}"
-        person, *named = (cell.strip() for cell in cells)
+        person, *named = map(_composed, cells)
         if person not in people or person in chosen or len(named) != 2:
             reason = (
                 "comes twice"

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from share.config import POLICY_NAMES
+from share.config import POLICY_NAMES, Config
 from share.errors import ConfigError, UsageError
 from share.files.json_file import parse_json, read_json
 from share.files.reading import MAX_SETTINGS_BYTES, read_errors, read_text
 from share.lab.study.orders import Balance, draw_orders
-from share.plain_data import MAX_NUMBER, from_mapping
+from share.plain_data import MAX_NUMBER, from_mapping, to_mapping
 from share.types import F64
 
 PLAN, KEY, UNBLINDED, TRIALS, ANSWERS = "plan.json", "key.json", "unblinded.json", "trials", "answers.jsonl"
@@ -148,7 +148,9 @@ class StudyKey:
                 raise ValueError(f"{letter}: policy '{name}' is not known; known: {', '.join(POLICY_NAMES)}")
 
     def seal(self, config: str) -> str:
-        """Return the digest by which a blind report shows a configuration, without telling it."""
+        """Return the digest by which a blind report shows a configuration, without telling it.
+
+        config: its text (`sealed_settings`)."""
         return hashlib.sha256(f"{self.salt}\0{config}".encode()).hexdigest()
 
     def text(self) -> str:
@@ -159,6 +161,11 @@ class StudyKey:
     def digest(self) -> str:
         """SHA-256 of its file, which the plan carries."""
         return hashlib.sha256(self.text().encode()).hexdigest()
+
+
+def sealed_settings(config: Config) -> str:
+    """Return a configuration as the text that is sealed."""
+    return json.dumps(to_mapping(config), sort_keys=True, separators=(",", ":"))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from share.lab.study.repeated_anova import PartialF
 from share.lab.study.study_analysis import MIN_COMPLETE, StudyAnalysis
 from share.robot.settings import CREATE3_SPEED_M_S
 
+_NOTHING = 1e-12  # below this a number is what rounding left
 Rows = list[list[str]]  # the first is the head
 
 
@@ -20,10 +21,19 @@ def p_text(p: float) -> str:
     return "–" if math.isnan(p) else "<0.001" if p < 0.001 else f"{p:.3f}"
 
 
+def value_text(value: float, form: str = ".2f") -> str:
+    """Return a number with fixed decimals, or with two digits where these would show another number as 0."""
+    text = format_number(value, form)
+    if math.isnan(value) or float(text) != 0:
+        return text
+    return text.lstrip("-") if abs(value) < _NOTHING else f"{value:.2g}"
+
+
 def _interval_text(one: Interval, form: str = ".2f") -> str:
     if math.isnan(one.low):
-        return format_number(one.value, form)
-    return f"{one.value:{form}} [{one.low:{form}}, {one.high:{form}}]"
+        return value_text(one.value, form)
+    value, low, high = (value_text(each, form) for each in (one.value, one.low, one.high))
+    return f"{value} [{low}, {high}]"
 
 
 def descriptive_rows(study: StudyAnalysis) -> Rows:
@@ -34,7 +44,7 @@ def descriptive_rows(study: StudyAnalysis) -> Rows:
             rows.append(
                 [
                     *(measure.name, one.condition, str(one.count), _interval_text(one.mean)),
-                    *(format_number(one.deviation, ".2f"), format_number(one.median, ".2f")),
+                    *(value_text(one.deviation), value_text(one.median)),
                     _span_text(one.lower_quartile, one.upper_quartile),
                     _span_text(one.least, one.greatest),
                 ]
@@ -43,7 +53,7 @@ def descriptive_rows(study: StudyAnalysis) -> Rows:
 
 
 def _span_text(low: float, high: float) -> str:
-    return "–" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
+    return "–" if math.isnan(low) else f"{value_text(low)} to {value_text(high)}"
 
 
 def comparison_rows(study: StudyAnalysis) -> Rows:
@@ -169,7 +179,7 @@ def overview_rows(study: StudyAnalysis) -> Rows:
     """Return a row for each measure: its means and its main tests."""
     rows = [["measure", "n", *study.conditions, "Friedman", "p", "W", "ANOVA", "p GG"]]
     for one, tested in zip(study.measures, comparison_rows(study)[1:], strict=True):
-        means = [format_number(condition.mean.value, ".2f") for condition in one.conditions]
+        means = [value_text(condition.mean.value) for condition in one.conditions]
         _, count, chi2, p, w, f, _, p_gg, *_ = tested
         rows.append([one.name, count, *means, chi2, p, w, f, p_gg])
     return rows

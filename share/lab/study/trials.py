@@ -17,12 +17,15 @@ import numpy as np
 
 from share.errors import DataError
 from share.files.json_file import own_format_errors, read_json_lines
+from share.files.reading import MB
 from share.lab.study.plan import TRIALS, StudyPlan, SuccessRule
 from share.robot.settings import CREATE3_SPEED_M_S
 
 EVENTS = "events.jsonl"
+MAX_LINES_BYTES = 20 * MB  # of a trial, or of all answers
 JUDGES = ("mocap", "map")
 _MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
+_NO_STATUS = "none"
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,8 @@ class RobotStop:
 
 @dataclass
 class CalledGoal:
-    """One call of the robot. straight_m: from the robot to the cube at the call; planned_m: the way there, as
-    planned, or straight_m."""
+    """One call of the robot. straight_m: from the robot to the cube at the call, NaN where the robot's place
+    was not known; planned_m: the way there, as planned, or straight_m."""
 
     spot: int
     called_s: float
@@ -46,11 +49,17 @@ class CalledGoal:
     planned_m: float
     first_motion_s: float = math.nan
     stops: list[RobotStop] = field(default_factory=list)
-    status: str = "none"  # the navigator's own
+    status: str = _NO_STATUS  # the navigator's own
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the navigator has said what became of it."""
+        return self.status != _NO_STATUS
 
     def timeout_s(self, rule: SuccessRule, longer: bool) -> float:
         """Return the time allowed; longer: with the time that the way takes at the robot's top speed."""
-        return rule.timeout_s + (self.planned_m / CREATE3_SPEED_M_S if longer else 0.0)
+        way_m = 0.0 if math.isnan(self.planned_m) else self.planned_m
+        return rule.timeout_s + (way_m / CREATE3_SPEED_M_S if longer else 0.0)
 
     def reached_s(self, rule: SuccessRule, longer: bool = False) -> float:
         """Return after how long the robot stood close enough; NaN if it did not in time."""
@@ -100,12 +109,16 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
     """Read the events of one trial, which must be the planned one. Raises DataError."""
     record = TrialRecord(condition, "", {}, False)
     wanted = {"participant": participant, "place": place, "condition": condition, "plan": plan.digest}
-    for number, event in enumerate(read_json_lines(path), 1):
+    for number, event in enumerate(read_json_lines(path, MAX_LINES_BYTES), 1):
         where = f"{path}, line {number}"
         with own_format_errors(Path(where)):
             kind = event["event"]
             if kind == "begin":
                 _check_begin(event, wanted, where)
+                if record.judge not in ("", event["judge"]):
+                    raise DataError(
+                        f"{where}: judge {event['judge']}, before {record.judge}; a trial has one"
+                    )
                 record.judge = event["judge"]
             elif not record.judge:
                 raise DataError(f"{where}: {kind} before begin")
@@ -134,12 +147,10 @@ def _check_begin(event: Mapping[str, Any], wanted: Mapping[str, Any], where: str
 
 
 def _read_call(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
-    cube, robot = (_position(event[name]) for name in ("cube_m", "robot_m"))
-    straight_m = math.dist(cube, robot)
-    goal = CalledGoal(
-        *(_whole(event["spot"]), _number(event["t_s"]), cube, straight_m),
-        _path_m(event.get("path_m", straight_m)),
-    )
+    cube, robot = _position(event["cube_m"]), event["robot_m"]
+    straight_m = math.nan if robot is None else math.dist(cube, _position(robot))
+    planned_m = _path_m(event["path_m"]) if "path_m" in event else straight_m
+    goal = CalledGoal(_whole(event["spot"]), _number(event["t_s"]), cube, straight_m, planned_m)
     number = _whole(event["goal"])
     if not (1 <= number <= len(plan.spots) and 1 <= goal.spot <= len(plan.spots)):
         raise ValueError(f"goal {number} at spot {goal.spot}; the plan has {len(plan.spots)} of each")
@@ -233,14 +244,15 @@ TRIAL_MEASURES = (
 def trial_measures(goals: Iterable[CalledGoal], rule: SuccessRule) -> dict[str, float]:
     """Return the measures of a complete trial: means over its goals; of times over the goals that have one.
 
-    path over straight line: sums over reached goals. final distance: at the last stop, of goals with one.
+    path over straight line: sums over reached goals whose straight line is known. final distance: at the last
+    stop, of goals with one.
     """
     called = list(goals)
     times, longer = (np.array([one.reached_s(rule, long) for one in called]) for long in (False, True))
     reached = [
         (next(stop.path_m for stop in goal.stops if stop.s == s), goal.straight_m)
         for goal, s in zip(called, times.tolist(), strict=True)
-        if not math.isnan(s)
+        if not math.isnan(s + goal.straight_m)
     ]
     driven, straight = (sum(one[k] for one in reached) for k in (0, 1))
     values = (

@@ -12,9 +12,10 @@ import pytest
 from helpers.study_folder import begin, fill, goal_events, small_plan, write_lines
 
 from share.errors import DataError
-from share.lab.study.observations import read_study, read_table
+from share.lab.study.observations import REPEATED_CALLS, read_study, read_table
 from share.lab.study.plan import SuccessRule
 from share.lab.study.study_analysis import analyse
+from share.lab.study.study_tables import value_text
 from share.lab.study.trials import REACHED, REACHED_LONGER, read_trials, trial_folder, trial_measures
 
 RULE = SuccessRule()
@@ -91,8 +92,13 @@ def test_repeated_calls_are_counted_by_spot(tmp_path: Path) -> None:
     assert "repeated" not in " ".join(read_study(tmp_path, PLAN, RULE).notes)
     calls = [goal_events(1, 1, None, 10.0), goal_events(1, 1, None, 50.0), goal_events(1, 1, 8.0, 90.0)]
     calls += [goal_events(2, 2, None, 200.0), goal_events(2, 2, 8.0, 300.0)]
+    assert REPEATED_CALLS not in read_study(tmp_path, PLAN, RULE).measures
     measures(*calls, study=tmp_path)
-    notes = read_study(tmp_path, PLAN, RULE).notes
+    table = read_study(tmp_path, PLAN, RULE)
+    counts = table.measures[REPEATED_CALLS]
+    letter = PLAN.letters.index(PLAN.participants[0].trials[0].condition)
+    assert counts[0, letter] == 3 and counts.sum() == 3  # a measure, compared between conditions as others
+    notes = table.notes
     assert any("3 calls were repeated" in note and note.endswith("spot 1 2, spot 2 1") for note in notes)
 
 
@@ -169,6 +175,17 @@ def test_wrong_events_are_refused_with_their_line(tmp_path: Path, lines: list[An
         read_trials(tmp_path, PLAN)
 
 
+@pytest.mark.parametrize("name", ["answers.jsonl", f"trials/{P01}-1/events.jsonl"])
+def test_a_file_larger_than_any_trial_is_refused(tmp_path: Path, soon: None, name: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        for _ in range(30):
+            file.write(b'{"event": "moves"}\n' * 50_000)
+    with pytest.raises(DataError, match=f"{path.name}.*MB"):
+        read_study(tmp_path, PLAN, RULE)
+
+
 def test_a_trial_that_is_not_planned_is_refused(tmp_path: Path) -> None:
     write_lines(tmp_path / "trials" / "p99-1" / "events.jsonl", [])
     with pytest.raises(DataError, match="p99-1: the plan has no such trial"):
@@ -234,6 +251,40 @@ def test_an_unfinished_trial_is_missing_and_said(tmp_path: Path) -> None:
     assert [one.complete for one in analyse(table).measures if one.name == REACHED] == [3]
 
 
+def test_judges_that_change_and_cubes_that_lie_elsewhere_are_said(tmp_path: Path) -> None:
+    fill(tmp_path, PLAN, KEY.policies)
+    goals = [*goal_events(1, 1, 8.0, 10.0), *goal_events(2, 2, 8.0, 60.0)]
+    cubes = [{**line, "cube_m": [2.0, 2.0]} if line.get("spot") == 2 else line for line in goals]
+    write_trial(tmp_path, begin(PLAN, P01, 1, judge="map"), *cubes, {"event": "end", "t_s": 99.0})
+    notes = read_study(tmp_path, PLAN, RULE).notes
+    assert any("trials are judged 1 by map and 15 by mocap; they do not compare" in note for note in notes)
+    assert any(
+        "15 of 32 cubes lay more than 0.5 m from their planned spot, the farthest 1.41 m from spot 2" in note
+        for note in notes
+    )  # `fill` puts all at spot 1
+
+
+def test_a_robot_whose_place_was_unknown_at_the_call(tmp_path: Path) -> None:
+    goals = [goal_events(1, 1, 31.0, 10.0), goal_events(2, 2, 8.0, 60.0)]
+    goals[0][0]["robot_m"] = None
+    found = measures(*goals, study=tmp_path)
+    assert (found[REACHED], found[REACHED_LONGER]) == (50.0, 50.0)  # no way is known, by which to wait longer
+    assert found["path over straight line"] == pytest.approx(3.3 / 3)
+
+
+def test_a_judge_that_changes_within_a_trial_is_refused(tmp_path: Path) -> None:
+    write_trial(tmp_path, begin(PLAN, P01, 1), begin(PLAN, P01, 1, judge="map"))
+    with pytest.raises(DataError, match="line 2: judge map, before mocap"):
+        read_trials(tmp_path, PLAN)
+
+
+def test_nobody_preferred_is_no_error(tmp_path: Path) -> None:
+    fill(tmp_path, PLAN, KEY.policies, participants=3)
+    path = tmp_path / "answers.jsonl"
+    path.write_text(path.read_text() + '{"participant": "p04", "most": null, "least": "A"}\n')
+    assert [ones[3] for ones in read_study(tmp_path, PLAN, RULE).choices.values()] == ["", "A"]
+
+
 HEAD = "participant,condition,place,rating\n"
 
 
@@ -273,6 +324,48 @@ def test_a_table_has_gaps(tmp_path: Path) -> None:
     table = read_table(tmp_path / "a.csv", {}, None)
     assert table.participants == ("p1", "p2") and table.places.tolist() == [[0, 0], [1, 0]]
     assert np.array_equal(table.measures["rating"], [[math.nan, 7], [5, math.nan]], equal_nan=True)
+
+
+def test_names_compare_composed(tmp_path: Path) -> None:
+    """A name that macOS has decomposed is the same person."""
+    (tmp_path / "a.csv").write_text(
+        "participant,condition,place,g\u00fcte\nj\u00f6rg,A,1,5\njo\u0308rg,B,2,7\n"
+    )
+    (tmp_path / "b.csv").write_text("participant,most,least\njo\u0308rg,A,B\n")
+    table = read_table(tmp_path / "a.csv", {"gu\u0308te": (1, 10)}, tmp_path / "b.csv")
+    assert table.participants == ("j\u00f6rg",) and table.choices["most"] == ("A",)
+    assert table.measures["g\u00fcte"].tolist() == [[5.0, 7.0]]
+
+
+def test_a_table_larger_than_any_study_is_refused(tmp_path: Path, soon: None) -> None:
+    (tmp_path / "a.csv").write_text(HEAD + "p,A,1,5\n" * 9000)
+    with pytest.raises(DataError, match="has over 8001 lines"):
+        read_table(tmp_path / "a.csv", {}, None)
+    (tmp_path / "a.csv").write_text(HEAD + "p,A,1,5\n" * 2_000_000)
+    with pytest.raises(DataError, match="MB"):
+        read_table(tmp_path / "a.csv", {}, None)
+    (tmp_path / "a.csv").write_text(
+        ",".join(["participant", "condition", "place", *map(str, range(101))]) + "\np,A,1\n"
+    )
+    with pytest.raises(DataError, match="has 101 measures; at most 100"):
+        read_table(tmp_path / "a.csv", {}, None)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1e-8, "1e-08"),
+        (-3.4e-5, "-3.4e-05"),
+        (0.004, "0.004"),
+        (0.0, "0.00"),
+        (-1e-17, "0.00"),
+        (1.005, "1.00"),
+        (-0.2, "-0.20"),
+        (math.nan, "–"),
+    ],
+)
+def test_a_small_value_is_not_shown_as_none(value: float, text: str) -> None:
+    assert value_text(value) == text
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,123 @@
+"""How far a study is: what is left to do for each participant, by the files that are there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from share.errors import DataError, UsageError
+from share.files.json_file import own_format_errors, read_json_lines
+from share.lab.study.plan import ANSWERS, Participant, StudyPlan
+from share.lab.study.trials import EVENTS, MAX_LINES_BYTES, read_trials, trial_folder
+
+
+@dataclass(frozen=True)
+class TrialStep:
+    """A trial is to be carried through. done: goals that have had their end; is_begun: it was interrupted."""
+
+    place: int
+    condition: str
+    done: frozenset[int]
+    is_begun: bool
+    last_s: float  # time of its last event, on its own clock
+
+
+@dataclass(frozen=True)
+class AnswerStep:
+    """The questions after a trial are to be asked."""
+
+    place: int
+    condition: str
+
+
+@dataclass(frozen=True)
+class ChoiceStep:
+    """The participant is to say which trial was best and worst. conditions: of those carried through, by
+    place."""
+
+    conditions: dict[int, str]
+
+
+StudyStep = TrialStep | AnswerStep | ChoiceStep
+
+
+@dataclass(frozen=True)
+class StudyProgress:
+    """What is left, by participant, in order."""
+
+    plan: StudyPlan
+    steps: dict[str, tuple[StudyStep, ...]]
+
+    def choose(self, name: str | None) -> tuple[Participant, tuple[StudyStep, ...]]:
+        """Return the participant of a name, or the next one, and what is left. Raises UsageError."""
+        people = {one.name: one for one in self.plan.participants}
+        left = [one for one in people if self.steps[one]]
+        following = f"the next is {left[0]}" if left else "all participants have"
+        if name is None:
+            if not left:
+                raise UsageError("all participants have done all trials; `share study unblind` comes next")
+            return people[left[0]], self.steps[left[0]]
+        if name not in people:
+            first, last = self.plan.participants[0].name, self.plan.participants[-1].name
+            raise UsageError(f"--participant {name}: not in the plan, which has {first} to {last}")
+        if not self.steps[name]:
+            raise UsageError(f"--participant {name}: has done all trials and answered; {following}")
+        return people[name], self.steps[name]
+
+
+def read_progress(folder: Path, plan: StudyPlan) -> StudyProgress:
+    """Return how far a study is. Raises DataError for trials or answers that are not the plan's."""
+    records = read_trials(folder, plan)  # checks them, too
+    answers = _read_rows(folder / ANSWERS)
+    answered = {(row.get("participant"), row.get("condition")) for row in answers if "answers" in row}
+    chosen = {row.get("participant") for row in answers if "most" in row or "least" in row}
+    steps = {}
+    for person in plan.participants:
+        left: list[StudyStep] = []
+        carried: dict[int, str] = {}
+        for place, trial in enumerate(person.trials, 1):
+            record = records.get((person.name, place))
+            end = _trial_end(trial_folder(folder, person.name, place) / EVENTS)
+            if end.is_left:
+                continue
+            if record is None or not record.is_complete:
+                done = frozenset(
+                    number for number, goal in (record.goals if record else {}).items() if goal.has_ended
+                )
+                left.append(TrialStep(place, trial.condition, done, record is not None, end.last_s))
+            carried[place] = trial.condition
+            if (person.name, trial.condition) not in answered:
+                left.append(AnswerStep(place, trial.condition))
+        if person.name not in chosen and len(carried) > 1:
+            left.append(ChoiceStep(carried))
+        steps[person.name] = tuple(left)
+    return StudyProgress(plan, steps)
+
+
+@dataclass(frozen=True)
+class _TrialEnd:
+    last_s: float = 0.0
+    is_left: bool = False
+
+
+def _trial_end(path: Path) -> _TrialEnd:
+    """Return what the last line of a trial tells."""
+    rows = _read_rows(path)
+    if not rows:
+        return _TrialEnd()
+    with own_format_errors(path):
+        return _TrialEnd(max(float(row["t_s"]) for row in rows), rows[-1].get("is_left") is True)
+
+
+def _read_rows(path: Path) -> list[Mapping[str, Any]]:
+    return list(read_json_lines(path, MAX_LINES_BYTES)) if path.exists() else []
+
+
+def left_goals(step: TrialStep, person: Participant, plan: StudyPlan) -> list[tuple[int, int]]:
+    """Return number and spot of the goals of a trial that are left."""
+    trial = person.trials[step.place - 1]
+    if trial.condition != step.condition:
+        raise DataError(f"{person.name}, place {step.place}: is condition {trial.condition}")
+    return [(number, spot) for number, spot in enumerate(trial.spots, 1) if number not in step.done]
