@@ -106,6 +106,11 @@ def _judge_notes(judges: Sequence[str], statuses: Mapping[str, int]) -> Iterable
             "reachability is judged by the map itself (no motion capture), which favours policies under "
             "which headset and robot drift together"
         )
+    if "simulation" in judges:
+        yield (
+            "participants are simulated, not people; reachability is judged by the simulation's truth, and "
+            "nobody rated anything"
+        )
     if statuses:
         yield "the navigator's own status of goals: " + ", ".join(
             f"{name} {count}" for name, count in sorted(statuses.items())

@@ -21,7 +21,7 @@ from share.lab.study.plan import TRIALS, StudyPlan, SuccessRule
 from share.robot.settings import CREATE3_SPEED_M_S
 
 EVENTS = "events.jsonl"
-JUDGES = ("mocap", "map")
+JUDGES = ("mocap", "map", "simulation")
 _MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
 
 
