@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.terminal import LiveLine, aligned_table
+from share.cli.terminal import LiveLine, aligned_table, print_note
 from share.errors import UsageError
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def simulate(
     Example:  share study simulate --participants 12 --goals 5 --air 5 --jobs 8 --out simulated
               share study analyze simulated --key simulated-key.json --out report
     """
+    from share.lab.evaluate.provenance import code_digest
     from share.lab.study.simulated_report import about_lines, result_rows
     from share.lab.study.simulated_study import begin_study, key_path
 
@@ -95,6 +96,8 @@ def simulate(
     )
     study = begin_study(out.absolute(), settings)
     if study.missing():
+        if study.code != code_digest():
+            print_note(str(out), "was begun by another version of the program; its trials may differ")
         _carry_out(study, jobs, scheduler)
     for line in about_lines(study):
         click.echo(f"* {line}")

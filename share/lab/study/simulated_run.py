@@ -13,7 +13,7 @@ from share.lab.study.simulated_trial import TrialDone, TrialJob, carry_out, sess
 
 # CPU seconds a simulated second of one trial takes, of 320 x 240 at 15 Hz on an AMD EPYC: before the first
 # trial is done, the estimate is by these
-_CPU_OF_TRIAL, _CPU_OF_AGENT, _CPU_OF_DRAWING = 0.9, 0.05, 0.6
+_CPU_OF_TRIAL, _CPU_OF_AGENT, _CPU_OF_DRAWING = 0.9, 0.08, 0.6
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

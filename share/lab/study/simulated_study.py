@@ -86,12 +86,13 @@ class SimulationSettings:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedStudy:
-    """A study that is under way."""
+    """A study that is under way. code: digest of the code by which it was begun."""
 
     folder: Path
     settings: SimulationSettings
     plan: StudyPlan
     key: StudyKey
+    code: str
 
     @cached_property
     def ground(self) -> FloorGraphs:
@@ -153,6 +154,8 @@ def begin_study(folder: Path, settings: SimulationSettings) -> SimulatedStudy:
         if study.settings != settings:
             raise UsageError(f"{folder}: {_difference(study.settings, settings)}; give another --out")
         return study
+    if key_path(folder).exists():
+        raise UsageError(f"{key_path(folder)}: exists and is not overwritten; give another --out")
     if folder.exists() and any(folder.iterdir()):
         raise UsageError(f"{folder}: is not empty and has no {SIMULATION}; give a new --out")
     ground = FloorGraphs(floor_from_occupancy(Occupancy.from_layout(make_layout(_room_recipe(settings)))))
@@ -168,11 +171,11 @@ def begin_study(folder: Path, settings: SimulationSettings) -> SimulatedStudy:
     )
     plan = replace(drawn, participants=people)
     writable_dir(folder)
-    write_private(key_path(folder), key.text(), replaces=True)
+    write_private(key_path(folder), key.text())
     atomic_write(folder / PLAN, plan_text(plan))
     made = {"schema": _SCHEMA, **asdict(settings), "version": __version__, "code": code_digest()}
     atomic_write(folder / SIMULATION, json.dumps(made, indent=1) + "\n")
-    return SimulatedStudy(folder, settings, plan, key)
+    return SimulatedStudy(folder, settings, plan, key, made["code"])
 
 
 @lru_cache(maxsize=2)
@@ -184,11 +187,10 @@ def open_study(folder: Path) -> SimulatedStudy:
     data = read_json(path)
     if data.pop("schema", None) != _SCHEMA:
         raise UsageError(f"{path}: is not a file of this kind and version ('{_SCHEMA}')")
-    for name in ("version", "code"):
-        data.pop(name, None)
-    plan = read_plan(folder)
+    data.pop("version", None)
+    plan, code = read_plan(folder), str(data.pop("code", ""))
     settings = from_mapping(SimulationSettings, data, str(path))
-    return SimulatedStudy(folder, settings, plan, read_key(key_path(folder), plan))
+    return SimulatedStudy(folder, settings, plan, read_key(key_path(folder), plan), code)
 
 
 def _difference(was: SimulationSettings, wanted: SimulationSettings) -> str:

@@ -78,6 +78,10 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is not empty and has no simulation"):
         begin_study(tmp_path, SETTINGS)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    (tmp_path / "other-key.json").write_text("mine")
+    with pytest.raises(UsageError, match="exists and is not overwritten"):
+        begin_study(tmp_path / "other", SETTINGS)
+    assert not (tmp_path / "other").exists()
 
 
 def test_other_agents_follow_each_other_and_every_third_is_a_robot() -> None:
@@ -249,7 +253,7 @@ def small_cache(tmp_path: Path, monkeypatch: Any) -> Path:
 def test_a_simulated_study_from_the_command_to_its_statistics(small_cache: Path) -> None:
     """One participant, four conditions, one call each: real pixels, trackers, edge and bridge."""
     study = small_cache / "study"
-    options = ("--participants", "1", "--goals", "1", "--timeout", "20", "--seed", "8001")
+    options = ("--participants", "1", "--goals", "1", "--timeout", "10", "--seed", "8001")
     result = simulate(study, *options)
     assert result.exit_code == 0, result.output
     assert "4 of 4 trials; simulated participants, not people" in result.output
