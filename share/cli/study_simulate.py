@@ -16,7 +16,6 @@ from share.errors import UsageError
 if TYPE_CHECKING:
     from share.lab.study.simulated_study import SimulatedStudy
 
-_AIRS = (5, 8, 15, 150)
 _SHARED_AGENTS = 12
 
 
@@ -30,9 +29,9 @@ _SHARED_AGENTS = 12
 )
 @click.option(
     "--air",
-    type=click.Choice([str(rate) for rate in _AIRS]),
+    type=options.NumberRange(0.5, 1000),
     metavar="MBIT",
-    help=f"All share the air of one access point, Mbit/s: {', '.join(map(str, _AIRS))}.",
+    help="All share the air of one access point of so many Mbit/s.",
 )
 @click.option(
     "--agents",
@@ -56,7 +55,7 @@ def simulate(
     participants: int,
     goals: int,
     network: str | None,
-    air: str | None,
+    air: float | None,
     agents: int | None,
     scene: str,
     mode: str,
@@ -86,7 +85,7 @@ def simulate(
     settings = _settings(
         participants=participants,
         goals=goals,
-        network=f"shared-{air}" if air else network or "wifi5",
+        network=f"shared-{air:g}" if air else network or "wifi5",
         agents=agents or (_SHARED_AGENTS if air else 3),
         seed=seed,
         scene=scene,

@@ -23,7 +23,7 @@ from share.lab.emulate.recipe import SessionRecipe
 from share.lab.emulate.small_pictures import profile_of_mode
 from share.lab.emulate.stage import make_layout
 from share.lab.emulate.world.occupancy import Occupancy
-from share.lab.evaluate.emulated_network import NETWORK_PRESETS
+from share.lab.evaluate.emulated_network import NETWORK_PRESETS, load_network
 from share.lab.evaluate.provenance import code_digest
 from share.lab.study.plan import (
     PAPER_POLICIES,
@@ -61,7 +61,8 @@ MAX_AGENTS = 50
 @dataclass(frozen=True)
 class SimulationSettings:
     """What a simulated study is made by. agents: on the network; those beyond participant, researcher and
-    robot are replayed. mode: of all devices. seconds: of the success rule; network: a preset."""
+    robot are replayed. mode: of all devices. network: a preset, or `shared-MBIT`. distance_m,
+    timeout_s: of the success rule."""
 
     participants: int = 20
     goals: int = 10
@@ -74,8 +75,11 @@ class SimulationSettings:
     timeout_s: float = 30.0
 
     def __post_init__(self) -> None:
-        if self.network not in NETWORK_PRESETS:
-            raise ValueError(f"network '{self.network}' is not known; known: {', '.join(NETWORK_PRESETS)}")
+        try:
+            load_network(self.network)
+        except UsageError:
+            known = ", ".join(NETWORK_PRESETS)
+            raise ValueError(f"network '{self.network}' is not known; known: {known}") from None
         if not OWN_AGENTS <= self.agents <= MAX_AGENTS:
             raise ValueError(f"agents {self.agents}: expected {OWN_AGENTS} to {MAX_AGENTS}")
 

@@ -21,7 +21,7 @@ from share.geometry.se3 import inverse
 from share.lab.emulate.recipe import SessionRecipe, no_progress
 from share.lab.emulate.session import make_cached_session
 from share.lab.emulate.small_pictures import profile_of_mode
-from share.lab.evaluate.emulated_network import NETWORK_PRESETS
+from share.lab.evaluate.emulated_network import load_network
 from share.lab.evaluate.processing_delays import ProcessingDelays
 from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.evaluate.virtual_time import track_session
@@ -94,7 +94,7 @@ class SimulatedTrial:
         config = replace(config, edge=replace(config.edge, policy=policy))
         seed, seconds = settings.seed * 1000 + index, self.planned.seconds + _TAIL_S
         rngs = [np.random.default_rng((seed, stream)) for stream in range(3)]
-        robot, network = usual_robot(), NETWORK_PRESETS[settings.network]
+        robot, network = usual_robot(), load_network(settings.network)
         start = start_pose(room.grid, room.people_at(0), rngs[0])
         base = RobotBase(DriveModel(), room.grid, start, inverse(robot.T_body_base), seconds, rngs[1])
         members = tracked_people(session, room, config, network, no_progress)
@@ -136,7 +136,7 @@ class SimulatedTrial:
 
     def _figures(self) -> dict[str, Any]:
         loop, participant = self.loop, self.participant
-        errors = participant.place_errors_m
+        errors, reports = participant.place_errors_m, loop.reports()
         airs = sum(air.busy_ns for air in loop.airs.values()) / loop.now_ns
         return {
             "presses": participant.presses,
@@ -144,6 +144,8 @@ class SimulatedTrial:
             "place_error_m": round(median(errors), 4) if errors else None,
             "place_error_p95_m": round(float(np.percentile(errors, 95)), 4) if errors else None,
             "air_busy": round(airs, 4),
+            "keyframes_sent": {name: one["sent"] for name, one in reports.items()},
+            "kb_up": {name: round(one["bytes_up"] / 1000) for name, one in reports.items()},
             "mapper_busy": round(loop.mapper_busy_ns / loop.now_ns, 4),
             "nearest_person_m": round(float(loop.nearest_person_m), 3),
             "lines": [[round(t, 2), text] for t, text in loop.lines],

@@ -232,7 +232,7 @@ def simulate(out: Path, *more: str) -> Result:
         (("--network", "5g"), "network '5g' is not known; known: wifi5"),
         (("--air", "5", "--network", "wifi5"), "leave out --network"),
         (("--agents", "2"), "2 is not in the range"),
-        (("--air", "7"), "'7' is not one of"),
+        (("--air", "0"), "0 is not in the range"),
         (("--mode", "small"), "--mode small: expected WxH@HZ"),
         (("--scene", "castle"), "castle"),
     ],
