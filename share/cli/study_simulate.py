@@ -50,6 +50,7 @@ _SHARED_AGENTS = 12
     metavar="tcp://HOST:PORT",
     help="Spread trials over the workers of this dask scheduler, which share the disk.",
 )
+@click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print what is there.")
 @options.out_folder
 def simulate(
     participants: int,
@@ -64,6 +65,7 @@ def simulate(
     seed: int,
     jobs: int,
     scheduler: str | None,
+    only_table: bool,
     out: Path,
 ) -> None:
     """Carry out a study with simulated participants under the paper's four policies, in virtual time.
@@ -94,7 +96,7 @@ def simulate(
         timeout_s=timeout,
     )
     study = begin_study(out.absolute(), settings)
-    if study.missing():
+    if study.missing() and not only_table:
         if study.code != code_digest():
             print_note(str(out), "was begun by another version of the program; its trials may differ")
         _carry_out(study, jobs, scheduler)
