@@ -96,6 +96,11 @@ COMMANDS = {
         "Send an emulated robot about in the room of a session.",
     ),
     "study": ("share.cli.study", "study", "Plan a blind study with people, and compute its statistics."),
+    "study simulate": (
+        "share.cli.study_simulate",
+        "simulate",
+        "Carry out a study with simulated participants.",
+    ),
     "marker": ("share.cli.marker", "marker", "Place, list and remove objects of the shared room."),
     "keys": ("share.cli.keys", "keys", "Manage the keys with which other machines connect to an edge."),
 }

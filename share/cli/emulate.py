@@ -125,6 +125,7 @@ def emulate(
               FILE.glb                  your own model of a room (glTF)
     \b
     Motions:  walk:[speed=0.9,…]        a person with a headset
+              visit:X Y UNTIL;…         a person who walks to places and stands there
               robot:[speed=0.35,…]      a robot with two wheels
               paper:1 .. paper:5        two people and a robot, 60 s, in 9x6x4 m
               board:[vigour=1,…]        a hand-held device before a calibration board

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from helpers.edge_sim import FOCAL, Person, hello_of, look, walls
@@ -90,6 +91,8 @@ class SeeingAgent:
 class Drive:
     """A robot and a headset, ann, whose wearer gives `goals`. ann_s: when ann comes."""
 
+    loop_type: Any = RobotLoop
+
     def __init__(
         self,
         goals: list[PlanarPose],
@@ -113,7 +116,8 @@ class Drive:
         link = NETWORK_PRESETS["wifi5"]
         members = [(self.ann.hello, frames, link)] if has_ann else []
         config = Config(edge=EdgeConfig(policy="covins-g"))
-        self.loop = RobotLoop(
+        self.ann_link = link
+        self.loop = self.loop_type(
             config,
             members,
             1,

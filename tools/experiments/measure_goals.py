@@ -32,7 +32,6 @@ from share import startup
 
 startup.prepare_process()
 
-import yaml  # noqa: E402
 from goal_figures import draw_goals, print_tables  # noqa: E402
 from make_keyframe_sets import seeds_of  # noqa: E402
 from tool_main import exit_code  # noqa: E402
@@ -40,18 +39,17 @@ from tool_main import exit_code  # noqa: E402
 from share.config import STREAMED, Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe, no_progress  # noqa: E402
-from share.lab.emulate.session import default_cache, make_cached_session  # noqa: E402
+from share.lab.emulate.session import make_cached_session  # noqa: E402
+from share.lab.emulate.small_pictures import profile_of_mode  # noqa: E402
 from share.lab.evaluate.provenance import describe_machine  # noqa: E402
 from share.lab.robot.report import goal_report, run_report  # noqa: E402
 from share.lab.robot.room import EmulatedRoom, open_room  # noqa: E402
 from share.lab.robot.simulate import SHARE, LoopOptions, LoopRun, prepare_run, usual_robot  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.scheduling.policies import POLICIES  # noqa: E402
-from share.sensors.profile import shipped_profiles  # noqa: E402
 
 _BLIND = ("truth", "wheels")
 _POLICIES = tuple(name for name in POLICIES if name != STREAMED)  # whose agents track
-_FULL = (640, 480)
 
 Row = dict[str, Any]
 
@@ -103,7 +101,7 @@ def about(options: argparse.Namespace, run: str, seed: int) -> Row:
 def one_room(options: argparse.Namespace, seed: int, runs: Sequence[str]) -> None:
     """Make the room, and drive in it."""
     began_s = time.perf_counter()
-    profiles = {"": profile_of(options.mode)}
+    profiles = {"": profile_of_mode(options.mode)}
     recipe = SessionRecipe(options.scene, ("ann=walk:",), options.headset_s, seed, profiles=profiles)
     sees = any(run not in _BLIND for run in runs)
     session = read_session(make_cached_session(recipe, workers=1)) if sees else None
@@ -122,7 +120,7 @@ def one_run(
     loop_options = LoopOptions(
         SHARE if sees else run, run if sees else SHARE, options.goals, None, seed, options.seconds
     )
-    loop_options = replace(loop_options, profile=profile_of(options.mode))
+    loop_options = replace(loop_options, profile=profile_of_mode(options.mode))
     driven = prepare_run(session, room, loop_options, Config(), usual_robot(), no_progress)
     count = 0
     for _ in driven.drive():
@@ -150,30 +148,6 @@ def goal_row(run: LoopRun, number: int) -> Row:
     outcome = run.outcomes[number]
     lines = [[round(t, 2), text] for t, text in run.loop.lines if t >= outcome.begun_s - 0.2]
     return goal_report(outcome) | {"lines": lines}
-
-
-def profile_of(mode: str) -> str:
-    """Return a D435i with pictures of a mode: itself, or a file in the user's cache with the view of 640x480
-    scaled. Raises UsageError."""
-    size, _, rate = mode.partition("@")
-    width, _, height = size.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and rate.isdecimal()):
-        raise UsageError(f"--mode {mode}: expected WxH@HZ such as 320x240@15")
-    if (int(width), int(height)) == _FULL:
-        return f"d435i:{mode}"
-    scale = int(height) / _FULL[1]
-    profile = yaml.safe_load(shipped_profiles()["d435i"].read_text())
-    full = next(one for one in profile["device"]["modes"] if (one["width"], one["height"]) == _FULL)
-    fx, fy, cx, cy = full["cam0"]["intrinsics"]
-    across = (int(width) - scale * _FULL[0]) / 2  # a narrower picture is cut from the middle
-    lens = [scale * fx, scale * fy, scale * (cx + 0.5) - 0.5 + across, scale * (cy + 0.5) - 0.5]
-    cameras = {name: {"intrinsics": [round(value, 3) for value in lens]} for name in ("cam0", "cam1")}
-    scaled = {"width": int(width), "height": int(height), "rates_hz": [int(rate)], **cameras}
-    profile["device"] |= {"modes": [scaled], "default_mode": mode}
-    file = default_cache() / f"d435i-{mode}.yaml"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(yaml.safe_dump(profile))
-    return str(file)
 
 
 # ---------------------------------------------------------------- the file

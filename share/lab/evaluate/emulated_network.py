@@ -13,6 +13,7 @@ through.
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
@@ -75,6 +76,7 @@ def _shared(mbps: float) -> NetworkModel:
     return NetworkModel(way, way, AirModel(mbps, 0.01))
 
 
+_SHARED_NAME = re.compile(r"shared-(\d{1,4}(?:\.\d{1,3})?)")
 NETWORK_PRESETS = {
     # 802.11ac, 80 MHz, one stream, a few metres from an access point without other devices
     "wifi5": NetworkModel(
@@ -136,10 +138,12 @@ class Channel:
 
 
 def load_network(name: str) -> NetworkModel:
-    """Return a preset by its name, or read a YAML file {up: {mbps, delay_ms, jitter_ms, loss, burst}, down:
-    {…}, air: {mbps, loss}}. Raises UsageError, ConfigError."""
+    """Return a preset by its name, shared air of any rate as `shared-2.5`, or read a YAML file {up: {mbps,
+    delay_ms, jitter_ms, loss, burst}, down: {…}, air: {mbps, loss}}. Raises UsageError, ConfigError."""
     if name in NETWORK_PRESETS:
         return NETWORK_PRESETS[name]
+    if (rate := _SHARED_NAME.fullmatch(name)) is not None and 0.1 <= float(rate[1]) <= 1000:
+        return _shared(float(rate[1]))
     path = Path(name)
     if not path.is_file():
         raise UsageError(f"--link: '{name}' is neither a file nor one of {', '.join(NETWORK_PRESETS)}")

@@ -89,11 +89,11 @@ class RobotLoop(BreakableRoom):
         network: NetworkModel,
         own_pose: Callable[[int], PlanarPose] | None = None,
         frame_times_ns: Sequence[int] = (),
+        delays: ProcessingDelays | None = None,
     ) -> None:
         own = [] if agent is None else [(agent.hello, iter(()), network)]
-        super().__init__(
-            config, [*members, *own], ProcessingDelays(), seed, on_effect=self._take_agent_effect
-        )
+        costs = ProcessingDelays() if delays is None else delays
+        super().__init__(config, [*members, *own], costs, seed, on_effect=self._take_agent_effect)
         self.base, self.navigator, self.lines = base, Navigator(), list[tuple[float, str]]()
         self.trace: list[tuple[float, PlanarPose, PlanarPose | None, str | None]] = []
         self.newest_poses: dict[str, aev.LocalisedPose] = {}

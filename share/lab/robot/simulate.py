@@ -16,7 +16,7 @@ from share.geometry.se3 import inverse
 from share.lab.emulate.recipe import Progress
 from share.lab.emulate.sensor.device import EmulatedDevice
 from share.lab.emulate.types import START_NS
-from share.lab.evaluate.emulated_network import NETWORK_PRESETS
+from share.lab.evaluate.emulated_network import NETWORK_PRESETS, NetworkModel
 from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.evaluate.virtual_time import track_session, tracked_frame
 from share.lab.robot.base import RobotBase
@@ -42,7 +42,7 @@ from share.wire.messages import Hello
 SHARE, TRUTH, WHEELS = "share", "truth", "wheels"
 LOCALISATIONS = (SHARE, TRUTH, WHEELS)
 LINK = "wifi5"
-_ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
+ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
 _FRAME_HZ = 15.0  # of a robot that knows its true place
 _STEP_S = 0.5
 _CAMERA_M = (0.09, 0.018, 0.21)
@@ -160,9 +160,9 @@ def _loop(
         return loop, GoalGiver(loop, draw, count, points_in_room)
     if session is None:
         raise ValueError("a robot that sees needs the session's recordings")
-    members = _people(session, room, config, progress)
-    sensors = _robot_sensors(room, base, options)
-    agent = EmulatedRobotAgent(sensors, config, _ROBOT_RUN, lambda text: loop.note(f"agent: {text}"))
+    members = tracked_people(session, room, config, network, progress)
+    sensors = robot_sensors(room, base, options.profile, options.seed, options.seconds)
+    agent = EmulatedRobotAgent(sensors, config, ROBOT_RUN, lambda text: loop.note(f"agent: {text}"))
     loop = RobotLoop(config, members, *common, agent, network)
     alone = HeadsetPointing(loop, ROBOT, lambda now_ns: base.body.part(now_ns, now_ns).poses(_at(now_ns))[0])
     if not room.people:
@@ -199,7 +199,9 @@ def _goal_source(
     return lambda here: next(given), len(options.goals)
 
 
-def _people(session: Session, room: EmulatedRoom, config: Config, progress: Progress) -> list[Member]:
+def tracked_people(
+    session: Session, room: EmulatedRoom, config: Config, network: NetworkModel, progress: Progress
+) -> list[Member]:
     """Return the session's headsets, tracked from their files; once where runs follow each other."""
     if not room.people:
         return []
@@ -212,17 +214,18 @@ def _people(session: Session, room: EmulatedRoom, config: Config, progress: Prog
         rig, frames = tracked[person.name]
         hello = Hello(person.name, person.kind, number, rig)
         arriving = (replace(one, arrival_ns=one.arrival_ns - START_NS) for one in frames)
-        members.append((hello, arriving, NETWORK_PRESETS[LINK]))
+        members.append((hello, arriving, network))
     progress(f"tracking {', '.join(names)}", 1, 1)
     return members
 
 
-def _robot_sensors(room: EmulatedRoom, base: RobotBase, options: LoopOptions) -> RobotSensors:
-    name, _, mode = options.profile.partition(":")
+def robot_sensors(
+    room: EmulatedRoom, base: RobotBase, profile_text: str, seed_number: int, seconds: float
+) -> RobotSensors:
+    """Return the robot's device in a room. profile_text: `NAME` or `NAME:MODE`; seconds: of the run."""
+    name, _, mode = profile_text.partition(":")
     profile = load_profile(name, mode or None)
-    seed = (options.seed, zlib.crc32(b"robot's device"))
+    seed = (seed_number, zlib.crc32(b"robot's device"))
     device = EmulatedDevice(profile, room.recipe.effects, seed, START_NS, (room.recipe.motion_seed, 8))
     bodies = Bodies(room.people)
-    return RobotSensors(
-        profile.rig(depth=False), device, room.open_renderer(), base.body, bodies.at, options.seconds
-    )
+    return RobotSensors(profile.rig(depth=False), device, room.open_renderer(), base.body, bodies.at, seconds)

@@ -136,6 +136,11 @@ def _judge_notes(judges: Mapping[str, int], statuses: Mapping[str, int]) -> Iter
             "reachability is judged by the map itself (no motion capture), which favours policies under "
             "which headset and robot drift together"
         )
+    if "simulation" in judges:
+        yield (
+            "participants are simulated, not people; reachability is judged by the simulation's truth, and "
+            "nobody rated anything"
+        )
     if statuses:
         yield "the navigator's own status of goals: " + ", ".join(
             f"{name} {count}" for name, count in sorted(statuses.items())

@@ -23,7 +23,7 @@ from share.robot.settings import CREATE3_SPEED_M_S
 
 EVENTS = "events.jsonl"
 MAX_LINES_BYTES = 20 * MB  # of a trial, or of all answers
-JUDGES = ("mocap", "map")
+JUDGES = ("mocap", "map", "simulation")
 _MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
 _NO_STATUS = "none"
 

@@ -141,6 +141,14 @@ def test_presets_and_files(tmp_path: Path) -> None:
         from_mapping(NetworkModel, {"air": {"mbps": -1}}, "a file")
 
 
+def test_shared_air_has_any_rate_by_its_name() -> None:
+    assert load_network("shared-2.5").air == AirModel(2.5, 0.01)
+    assert load_network("shared-5") is NETWORK_PRESETS["shared-5"]
+    for name in ("shared-0", "shared-", "shared-5000", "shared-2.5e1"):
+        with pytest.raises(UsageError, match="is neither a file nor one of"):
+            load_network(name)
+
+
 def test_shared_air_is_refused_in_real_time() -> None:
     links = LinkAssignment.parse("wifi5,bob=shared-8")
     links.check(["ann", "bob"], virtual=True)

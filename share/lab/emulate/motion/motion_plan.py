@@ -40,10 +40,12 @@ from share.lab.emulate.motion.spec import (
     RobotSpec,
     Spec,
     TumSpec,
+    VisitSpec,
     WalkSpec,
     parse_motion,
 )
 from share.lab.emulate.motion.spline import read_tum_path
+from share.lab.emulate.motion.visits import visiting_paths
 from share.lab.emulate.types import MotionPath
 from share.lab.emulate.world.layout import Layout
 from share.lab.emulate.world.occupancy import Occupancy
@@ -144,6 +146,7 @@ def plan_motions(specs: Sequence[str], layout: Layout, seconds: float, seed: int
     agents += [
         _board_agent(a, a.spec, layout, seconds, seed) for a in requests if isinstance(a.spec, BoardSpec)
     ]
+    agents += _visiting_agents(requests, layout, [_fixed_path(agent) for agent in agents], seconds, seed)
     agents += _simulated_agents(requests, layout, [_fixed_path(agent) for agent in agents], seconds, seed)
     order = [name for a in requests for name in _agent_names(a)]
     if any(isinstance(a.spec, PaperSpec) for a in requests) and seconds != PAPER_S:
@@ -196,6 +199,24 @@ def _recorded_agent(request: _NamedSpec, seconds: float) -> PlannedAgent:
     notes = (*recording.notes, *_short_note(recording.path, seconds))
     mount, noise = recording.T_body_cam0, recording.noise
     return PlannedAgent(request.name, kind, spec.look, recording.path, request.text, mount, noise, notes)
+
+
+def _visiting_agents(
+    requests: Sequence[_NamedSpec], layout: Layout, fixed: Sequence[FixedPath], seconds: float, seed: int
+) -> list[PlannedAgent]:
+    """Return the people who walk to given places."""
+    visitors = [(a, a.spec) for a in requests if isinstance(a.spec, VisitSpec)]
+    if not visitors:
+        return []
+    rng = np.random.default_rng((seed, 75))
+    heights = [spec.height or float(rng.uniform(*_EYE_HEIGHTS_M)) for _, spec in visitors]
+    ground = FloorGraphs(floor_from_occupancy(Occupancy.from_layout(layout)))
+    specs = [spec for _, spec in visitors]
+    paths = visiting_paths(ground, specs, heights, fixed, _gaze_targets(layout, rng), seconds, (seed, 76))
+    return [
+        PlannedAgent(a.name, AgentKind.AR, "person", path, a.text, has_camera_axes=True)
+        for (a, _), path in zip(visitors, paths, strict=True)
+    ]
 
 
 def _board_agent(

@@ -117,6 +117,19 @@ class FloorGraph:
             legs.append(leg)
         return legs
 
+    def way(self, start: F64, end: F64) -> F64:
+        """Return the cheapest way (N, 2) m between the free places nearest to two places (2,).
+
+        Raises ValueError where there is no free place.
+        """
+        from scipy.sparse.csgraph import dijkstra
+
+        if not len(self._cells):
+            raise ValueError("the floor has no free place")
+        first, last = (int(np.argmin(np.linalg.norm(self.places - xy, axis=1))) for xy in (start, end))
+        _, before = dijkstra(self._graph, indices=first, return_predecessors=True)
+        return self._shortest_path(before, first, last)
+
     def _next_leg(self, start_cell: int, ahead: F64 | None, rng: Rng) -> tuple[F64, int]:
         from scipy.sparse.csgraph import dijkstra
 

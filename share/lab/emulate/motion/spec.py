@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from dataclasses import dataclass, fields
 from typing import TypeAlias
@@ -109,6 +110,41 @@ class BoardSpec:
         _check_range("vigour", self.vigour, 0.1, 2.0, "times the usual speed")
 
 
+@dataclass(frozen=True)
+class VisitSpec:
+    """`visit:X Y [UNTIL];X Y [UNTIL];…` is a person with a headset who walks to places, m, and stands at each
+    until a time, s. Without any time it walks from place to place, round and round, and keeps off those who
+    have times. speed, height, turns: as of a walk."""
+
+    places: str = ""
+    speed: float = 0.9
+    height: float | None = None
+    turns: float = 2.6
+
+    def __post_init__(self) -> None:
+        WalkSpec(self.speed, height=self.height, turns=self.turns)  # checks them
+        times = [until_s for _, _, until_s in self.stops if until_s is not None]
+        if times and (len(times) < len(self.stops) or times != sorted(times)):
+            raise ValueError("give a time for each place, rising, or for none")
+
+    @property
+    def stops(self) -> list[tuple[float, float, float | None]]:
+        """x, y, m, and until when it stands there, s after the session's begin. Raises ValueError."""
+        found: list[tuple[float, float, float | None]] = []
+        for text in self.places.split(";"):
+            try:
+                x, y, *until = map(float, text.split())
+                [until_s] = until or [math.nan]
+            except ValueError:
+                raise ValueError(f"place '{text:.40}' is not X Y or X Y UNTIL, m and s") from None
+            if not all(map(math.isfinite, (x, y, *until))):
+                raise ValueError(f"place '{text:.40}' is not finite")
+            found.append((x, y, until_s if until else None))
+        if len(found) < 2:
+            raise ValueError("names fewer than two places")
+        return found
+
+
 PAPER_S = 60.0  # of an experiment of the paper
 
 
@@ -119,13 +155,14 @@ class PaperSpec:
     number: int = 1
 
 
-Spec: TypeAlias = EurocSpec | TumviSpec | TumSpec | WalkSpec | RobotSpec | BoardSpec | PaperSpec
+Spec: TypeAlias = EurocSpec | TumviSpec | TumSpec | WalkSpec | VisitSpec | RobotSpec | BoardSpec | PaperSpec
 
 SPEC_KINDS: dict[str, type[Spec]] = {
     "euroc": EurocSpec,
     "tumvi": TumviSpec,
     "tum": TumSpec,
     "walk": WalkSpec,
+    "visit": VisitSpec,
     "robot": RobotSpec,
     "board": BoardSpec,
     "paper": PaperSpec,
@@ -169,11 +206,11 @@ def _make_spec(kind: str, argument: str, options: dict[str, str], text: str) -> 
                 f"'{text}': the paper has five experiments; say paper:1 to paper:5, nothing more"
             )
         return PaperSpec(int(argument))
-    takes_path = issubclass(cls, RecordedSpec)
-    if argument and not takes_path:
+    takes = "path" if issubclass(cls, RecordedSpec) else "places" if cls is VisitSpec else None
+    if argument and takes is None:
         known = ", ".join(f.name for f in fields(cls))
         raise UsageError(f"'{text}': '{argument}' is not key=value; known keys: {known}")
-    return from_mapping(cls, options | ({"path": argument} if takes_path else {}), f"'{text}'")
+    return from_mapping(cls, options | ({takes: argument} if takes else {}), f"'{text}'")
 
 
 def _check_one_of(name: str, value: str, known: tuple[str, ...]) -> None:
