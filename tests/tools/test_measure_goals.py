@@ -10,6 +10,7 @@ import pytest
 from helpers.experiments import experiment
 
 from share.errors import UsageError
+from share.lab.emulate.small_pictures import profile_of_mode
 from share.sensors.profile import load_profile
 
 WORDS = ["--scene", "plain", "--seeds", "3:4", "--runs", "truth", "--seconds", "60", "--headset-s", "10"]
@@ -64,15 +65,15 @@ def test_pictures_are_scaled_and_cut_from_the_middle(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     full, half = (
-        load_profile(*name.split(":")) for name in ("d435i:640x480@15", tool.profile_of("320x240@15") + ":")
+        load_profile(*name.split(":")) for name in ("d435i:640x480@15", profile_of_mode("320x240@15") + ":")
     )
     whole, small = full.rig(depth=False).cam0, half.rig(depth=False).cam0
     assert (small.width, small.height, half.rate_hz) == (320, 240, 15)
     assert small.fx == whole.fx / 2 and small.cx == pytest.approx((whole.cx + 0.5) / 2 - 0.5, abs=1e-3)
-    narrow = load_profile(tool.profile_of("280x240@10")).rig(depth=False).cam0
+    narrow = load_profile(profile_of_mode("280x240@10")).rig(depth=False).cam0
     assert narrow.cx == pytest.approx(small.cx - 20, abs=1e-3)
     with pytest.raises(UsageError, match="expected WxH@HZ"):
-        tool.profile_of("small")
+        profile_of_mode("small")
 
 
 @pytest.mark.slow

@@ -179,7 +179,7 @@ def test_slow_tracking_delays_frames_and_slow_solving_delays_corrections() -> No
     usual = world(seconds=3.0)
     slow = world(seconds=3.0, frame=Delay(70.0, 70.0))
     waits = np.diff(track_ms(slow, "ann"))
-    assert np.median(waits) == pytest.approx(20.0, abs=3.0)  # 70 ms each, every 50 ms
+    assert 20.0 < np.median(waits) < 26.0  # 70 ms each, every 50 ms, and slices of keyframe work
     late = world(seconds=3.0, solve=Delay(300.0, 300.0))
     assert min(corrected_ms(late, "bob")) > 300 > np.median(corrected_ms(usual, "bob"))
     assert np.mean(track_ms(late, "bob")) == pytest.approx(np.mean(track_ms(usual, "bob")), rel=0.1)
