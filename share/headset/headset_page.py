@@ -95,7 +95,8 @@ class HeadsetPage(ServedPage):
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
         table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
-        SessionLedger("", default_folder())  # a damaged one is said before the page is served
+        session_key(default_folder())  # what is wrong is said before the page is served
+        SessionLedger("", default_folder())
         listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
@@ -110,7 +111,6 @@ class HeadsetPage(ServedPage):
             where.host,
             self.endpoint,
             self.certificate,
-            session_key(default_folder()),
             default_folder(),
             time.monotonic(),
             known_mounts,

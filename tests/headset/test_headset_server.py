@@ -537,6 +537,37 @@ def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomSer
                 assert answer == "welcome" or (said["is_over"] and "another headset" in said["reason"])
 
 
+def test_who_removes_what_sessions_are_signed_with_has_all_pair_anew(
+    site: Path, edge: RoomServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the edge advises where the ledger is damaged: also while it runs, from the page's next start on."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    told: list[str] = []
+    with closing(serve(site, edge.address, notify=told.append)) as page:
+        sessions = []
+        for _ in range(2):
+            with paired(page, "ann") as ann:
+                sessions.append(ann.seen[0]["session"])
+            assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": 0})["is_connected"])
+        (default_folder() / LEDGER_FILE).write_text("[{")
+        with paired(page, "bob"):
+            pass
+        assert any("as it is, the page cannot start again" in line for line in told)
+        os.kill(page.pid or 0, signal.SIGKILL)
+        assert soon(lambda: any("has ended (LedgerDamagedError: " in line for line in told))
+        for name in (LEDGER_FILE, "headset.secret"):
+            (default_folder() / name).unlink()
+
+        def back() -> Any:
+            with suppress(OSError):
+                return PageClient(page.endpoint)
+
+        for session in sessions:
+            with soon(back) as again:
+                said = again.hello(session=session)
+                assert said["is_over"] and "not known here" in said["reason"]
+
+
 def test_two_edges_of_a_machine_have_sessions_of_their_own(site: Path, edge: RoomServer) -> None:
     with closing(serve(site, edge.address)) as one, closing(serve(site, edge.address)) as other:
         sessions = []
