@@ -6,6 +6,7 @@ import contextlib
 import socket
 import time
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -102,6 +103,8 @@ class HeadsetPage(ServedPage):
         self.scheme = "https" if is_encrypted else "http"
         shown = str(Address(shown_host(bound.host), bound.port)).removeprefix("tcp://")
         self.url = f"{self.scheme}://{shown}/"
+        if self.certificate is not None and self.certificate.ends_soon(datetime.now(UTC)):
+            notify(f"headset page: its certificate ends at {self.certificate.end:%Y-%m-%d %H:%M} UTC; give a newer one")
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
         self._has_keys = access.keys_folder is not None
