@@ -250,7 +250,8 @@ class HeadsetServer:
             connection.transport.abort()
             return
         except (PairingError, page.MessageError) as error:
-            await refuse(connection, str(error), isinstance(error, SessionOverError))
+            is_outdated = isinstance(error, page.OtherSchemaError)
+            await refuse(connection, str(error), isinstance(error, SessionOverError), is_outdated)
             return
         self._connections.leave(connection)  # its place is its own from now on
         seat, taken_over = PageSeat(connection, rights), wearer.seat

@@ -134,6 +134,7 @@ def test_nothing_is_said_before_a_code(fresh: HeadsetPage) -> None:
             "type": "refused",
             "reason": "a page begins with hello",
             "is_over": False,
+            "is_outdated": False,
         }
         assert stranger.is_closed()
     used = code(fresh)
@@ -141,10 +142,19 @@ def test_nothing_is_said_before_a_code(fresh: HeadsetPage) -> None:
     for wrong in ({"code": used, "name": "bob"}, {"session": "A" * 64}):  # replayed; forged
         with PageClient(fresh.endpoint) as stranger:
             answer = stranger.hello(**wrong)
-            assert answer["type"] == "refused" and list(answer) == ["type", "reason", "is_over"]
+            assert answer["type"] == "refused" and list(answer) == ["type", "reason", "is_over", "is_outdated"]
             assert answer["is_over"] == ("session" in wrong)
             assert stranger.is_closed() and len(stranger.seen) == 1
     assert code(fresh) != used
+
+
+def test_a_page_of_another_release_is_told_to_load_itself_again(fresh: HeadsetPage) -> None:
+    with PageClient(fresh.endpoint) as old:
+        old.send(type="hello", schema=2, session="x", further=[1])
+        answer = old.hear()
+        assert answer["is_outdated"] and not answer["is_over"]
+        assert answer["reason"].startswith("this page is of another release than the edge: load it again")
+        assert old.is_closed()
 
 
 def test_a_code_is_not_used_up_by_a_name_that_is_none(fresh: HeadsetPage) -> None:

@@ -143,3 +143,21 @@ def test_a_lost_server_comes_back_and_nothing_is_lost(chromium: Browser, room: H
     room.drop()
     page.wait("!app.connection.isPaired && !document.getElementById('start').hidden")
     assert "pair again" in page.app("document.getElementById('reason').textContent")
+
+
+def test_a_page_of_another_release_loads_itself_again_once(chromium: Browser, room: HeadsetRoom) -> None:
+    page = chromium.page(room.url)
+    worn.pair(page, "ann")
+    page.wait("app.connection.isConnected")
+    page.evaluate("(window.isOld = true, 0)")
+    room.hindrance, room.is_outdated = "this page is of another release", True
+    room.drop()
+    page.wait_for("window.isOld === undefined && sessionStorage.getItem('share-outdated') === '1'")
+    page.wait("app.connection.text.includes('another release')")  # it is no other one: it tries later
+    page.evaluate("(window.isOld = true, 0)")
+    page.wait("app.connection.text.includes('connecting again')", 20)
+    page.wait("app.connection.text.includes('another release')", 20)
+    assert page.app("window.isOld && app.connection.isPaired")
+    room.hindrance = ""
+    page.wait("app.connection.isConnected && app.wearer === 'ann'", 20)  # by the session that it kept
+    assert page.evaluate("sessionStorage.getItem('share-outdated')") is None
