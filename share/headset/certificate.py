@@ -84,15 +84,15 @@ def given_certificate(certificate: Path, key: Path, now: datetime | None = None)
     if found.end <= now:
         raise UsageError(f"{where}: it was valid until {found.end:%Y-%m-%d}; give a newer one")
     if found.begin > now:
-        text = f"it is valid from {found.begin:%Y-%m-%d %H:%M} UTC on; give another, or set this machine's clock"
+        text = f"it is valid from {found.begin:%Y-%m-%d %H:%M} UTC on; give another, or set the clock"
         raise UsageError(f"{where}: {text}")
     found.context()
     return found
 
 
 def own_certificate(folder: Path, host: str, now: datetime | None = None) -> PageCertificate:
-    """Return the certificate in `folder`, made if there is none or it is not valid now. host: that is listened on.
-    Raises UsageError, also where it has to be made without the package `cryptography`."""
+    """Return the certificate in `folder`, made if there is none or it is not valid now. host: that is
+    listened on. Raises UsageError, also where it has to be made without the package `cryptography`."""
     now = now or datetime.now(UTC)
     certificate, key = folder / _CERTIFICATE, folder / _KEY
     _make_folder(folder)
@@ -148,7 +148,8 @@ def _names_and_times(certificate: Path) -> tuple[tuple[str, ...], datetime, date
         raise ValueError from None
     names = tuple(str(value) for kind, value in about.get("subjectAltName", ()) if kind == "DNS")
     begin, end = (
-        datetime.fromtimestamp(ssl.cert_time_to_seconds(about[name]), UTC) for name in ("notBefore", "notAfter")
+        datetime.fromtimestamp(ssl.cert_time_to_seconds(about[name]), UTC)
+        for name in ("notBefore", "notAfter")
     )
     return names, begin, end
 

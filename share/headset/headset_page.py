@@ -104,7 +104,8 @@ class HeadsetPage(ServedPage):
         shown = str(Address(shown_host(bound.host), bound.port)).removeprefix("tcp://")
         self.url = f"{self.scheme}://{shown}/"
         if self.certificate is not None and self.certificate.ends_soon(datetime.now(UTC)):
-            notify(f"headset page: its certificate ends at {self.certificate.end:%Y-%m-%d %H:%M} UTC; give a newer one")
+            end = f"{self.certificate.end:%Y-%m-%d %H:%M} UTC"
+            notify(f"headset page: its certificate ends at {end}; give a newer one")
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
         self._has_keys = access.keys_folder is not None

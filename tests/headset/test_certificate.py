@@ -56,7 +56,8 @@ def test_one_that_is_not_valid_yet_is_made_anew_and_a_given_one_refused(tmp_path
     now = datetime.now(UTC)
     early = own_certificate(tmp_path, "::1", now + timedelta(days=30))
     with pytest.raises(
-        UsageError, match=r"--headset-cert .*: it is valid from 20\d\d-\d\d-\d\d \d\d:\d\d UTC on; give another"
+        UsageError,
+        match=r"--headset-cert .*: it is valid from 20\d\d-\d\d-\d\d \d\d:\d\d UTC on; give another",
     ):
         given_certificate(early.certificate, early.key, now)
     assert given_certificate(early.certificate, early.key, now + timedelta(days=30)) == early

@@ -13,7 +13,8 @@ from share.headset.page_requests import FOLDER
 
 _SCENE = """
 const { source, statuses, startsAtMs, failsAtMs, endMs, count } = JSON.parse(require("fs").readFileSync(0));
-const timers = [], store = new Map([["share-loads", count]]), listeners = {}, told = [], asked = [], reloads = [];
+const timers = [], store = new Map([["share-loads", count]]), listeners = {};
+const told = [], asked = [], reloads = [];
 let nowMs = 0;
 const loading = {
     isConnected: true, setAttribute() {},
@@ -39,7 +40,8 @@ const world = {
 };
 if (startsAtMs !== null) world.setTimeout(() => (loading.isConnected = false), startsAtMs);
 new Function(...Object.keys(world), source)(...Object.values(world));
-if (failsAtMs !== null) world.setTimeout(() => listeners.error({ target: new HTMLScriptElement() }), failsAtMs);
+const fail = () => listeners.error({ target: new HTMLScriptElement() });
+if (failsAtMs !== null) world.setTimeout(fail, failsAtMs);
 (async () => {
     while (reloads.length === 0) {
         timers.sort((a, b) => a.atMs - b.atMs);

@@ -82,7 +82,9 @@ def test_what_is_malformed_is_one_line(data: str | bytes) -> None:
     assert "\n" not in str(refused.value) and len(str(refused.value)) <= 300
 
 
-@pytest.mark.parametrize("data", ['{"type":"hello","schema":2,"code":"1"}', '{"schema":0,"type":"hello","name":[]}'])
+@pytest.mark.parametrize(
+    "data", ['{"type":"hello","schema":2,"code":"1"}', '{"schema":0,"type":"hello","name":[]}']
+)
 def test_a_hello_of_another_schema_says_what_to_do(data: str) -> None:
     with pytest.raises(page.OtherSchemaError, match=r"^this page is of another release .*: load it again"):
         page.decode_page(data)
