@@ -29,13 +29,18 @@ _SECRET_BYTES = 32
 @dataclass(frozen=True)
 class PageCertificate:
     """Files of a certificate and its key (PEM). fingerprint: SHA-256, in pairs of digits. names: of whom it
-    is. end: when it is over."""
+    is. begin, end: when it is valid."""
 
     certificate: Path
     key: Path
     fingerprint: str
     names: tuple[str, ...]
+    begin: datetime
     end: datetime
+
+    def ends_soon(self, now: datetime) -> bool:
+        """Return whether it ends within a day."""
+        return self.end <= now + timedelta(days=1)
 
     def context(self) -> ssl.SSLContext:
         """Return the settings of a TLS server with it. Raises UsageError."""
@@ -75,17 +80,19 @@ def given_certificate(certificate: Path, key: Path, now: datetime | None = None)
     """Return the certificate in two files. Raises UsageError."""
     found = _described(certificate, key, f"--headset-cert {certificate}")
     _check_secret(key, f"--headset-key {key}")
-    if found.end <= (now or datetime.now(UTC)):
-        raise UsageError(
-            f"--headset-cert {certificate}: it was valid until {found.end:%Y-%m-%d}; give a newer one"
-        )
+    now, where = now or datetime.now(UTC), f"--headset-cert {certificate}"
+    if found.end <= now:
+        raise UsageError(f"{where}: it was valid until {found.end:%Y-%m-%d}; give a newer one")
+    if found.begin > now:
+        text = f"it is valid from {found.begin:%Y-%m-%d %H:%M} UTC on; give another, or set the clock"
+        raise UsageError(f"{where}: {text}")
     found.context()
     return found
 
 
 def own_certificate(folder: Path, host: str, now: datetime | None = None) -> PageCertificate:
-    """Return the certificate in `folder`, made if there is none or it is over. host: that is listened on.
-    Raises UsageError, also where it has to be made without the package `cryptography`."""
+    """Return the certificate in `folder`, made if there is none or it is not valid now. host: that is
+    listened on. Raises UsageError, also where it has to be made without the package `cryptography`."""
     now = now or datetime.now(UTC)
     certificate, key = folder / _CERTIFICATE, folder / _KEY
     _make_folder(folder)
@@ -98,7 +105,7 @@ def own_certificate(folder: Path, host: str, now: datetime | None = None) -> Pag
             except UsageError as error:
                 text = str(error).removeprefix("--headset-key ")
                 raise UsageError(f"{text}; remove it, and one is made with its key") from None
-            if found.end > now + timedelta(days=1):
+            if found.begin <= now and not found.ends_soon(now):
                 return found
         _make(certificate, key, host, now)
     return _described(certificate, key, str(certificate))
@@ -124,23 +131,27 @@ def _described(certificate: Path, key: Path, where: str) -> PageCertificate:
     try:
         first = text[text.index(ssl.PEM_HEADER) :].partition(ssl.PEM_FOOTER)[0]
         der = ssl.PEM_cert_to_DER_cert(f"{first.strip()}\n{ssl.PEM_FOOTER}\n")
-        names, end = _names_and_end(certificate)
+        names, begin, end = _names_and_times(certificate)
     except ValueError:
         raise UsageError(f"{where}: is no certificate (PEM)") from None
     digits = hashlib.sha256(der).hexdigest().upper()
     pairs = ":".join(digits[k : k + 2] for k in range(0, len(digits), 2))
-    return PageCertificate(certificate, key, pairs, names, end)
+    return PageCertificate(certificate, key, pairs, names, begin, end)
 
 
-def _names_and_end(certificate: Path) -> tuple[tuple[str, ...], datetime]:
-    """Return the names in a certificate and when it is over. Raises ValueError."""
+def _names_and_times(certificate: Path) -> tuple[tuple[str, ...], datetime, datetime]:
+    """Return the names in a certificate, and from and until when it is valid. Raises ValueError."""
     try:
         # Python's own tests read certificates by this; its public doors read only those of a peer
         about = ssl._ssl._test_decode_cert(str(certificate))  # type: ignore[attr-defined]
     except OSError:  # ssl.SSLError too
         raise ValueError from None
     names = tuple(str(value) for kind, value in about.get("subjectAltName", ()) if kind == "DNS")
-    return names, datetime.fromtimestamp(ssl.cert_time_to_seconds(about["notAfter"]), UTC)
+    begin, end = (
+        datetime.fromtimestamp(ssl.cert_time_to_seconds(about[name]), UTC)
+        for name in ("notBefore", "notAfter")
+    )
+    return names, begin, end
 
 
 def _make(certificate: Path, key: Path, host: str, now: datetime) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import socket
 import time
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -95,12 +96,16 @@ class HeadsetPage(ServedPage):
         self.certificate = page_certificate(certificate, key, is_encrypted, where.host)
         table = None if out is None else begin_table(writable_dir(out, HEADSET_TABLE) / HEADSET_TABLE)
         known_mounts = read_mounts(mounts)
-        SessionLedger("", default_folder())  # a damaged one is said before the page is served
+        session_key(default_folder())  # what is wrong is said before the page is served
+        SessionLedger("", default_folder())
         listener, bound = listen(where)
         self.endpoint = str(bound).removeprefix("tcp://")
         self.scheme = "https" if is_encrypted else "http"
         shown = str(Address(shown_host(bound.host), bound.port)).removeprefix("tcp://")
         self.url = f"{self.scheme}://{shown}/"
+        if self.certificate is not None and self.certificate.ends_soon(datetime.now(UTC)):
+            end = f"{self.certificate.end:%Y-%m-%d %H:%M} UTC"
+            notify(f"headset page: its certificate ends at {end}; give a newer one")
         self._notify, self._decoder = notify, msgspec.json.Decoder(ServerReport)
         self._report: dict[str, Any] = {}
         self._has_keys = access.keys_folder is not None
@@ -110,7 +115,6 @@ class HeadsetPage(ServedPage):
             where.host,
             self.endpoint,
             self.certificate,
-            session_key(default_folder()),
             default_folder(),
             time.monotonic(),
             known_mounts,

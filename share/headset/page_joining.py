@@ -16,7 +16,7 @@ _STYLE = re.compile(r'<link rel="stylesheet" href="([\w-]+\.css)">')
 _SCRIPT = re.compile(r'<script src="([\w-]+\.js)"></script>')
 _INLINE = re.compile(rb"<(style|script)>(.*?)</\1>", re.DOTALL)
 _IMPORT = re.compile(r'^import (\{[\w, ]+\}) from "\./([\w-]+\.js)";$', re.MULTILINE)
-_EXPORT = re.compile(r"^export (?=(?:const|class|function) (\w+))", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:const|class|function) (\w+)(?![\w$]))", re.MULTILINE)
 _OTHER = re.compile(r"^\s*(?:import|export)\b.*|\bimport\.meta\b", re.MULTILINE)
 
 
@@ -45,16 +45,22 @@ def _add_imported(name: str, files: Mapping[str, str], parts: dict[str, str], ab
     """Add what a module imports, each before what needs it."""
     if name in above:
         raise ValueError(f"{name} imports itself, by {above[-1]}")
-    for _, other in _IMPORT.findall(files[name]):
-        if other in parts:
-            continue
-        _add_imported(other, files, parts, (*above, name))
-        exported = ", ".join(_EXPORT.findall(files[other]))
-        body = _body(other, files[other], keeps_exports=False)
-        parts[other] = f"const {_variable(other)} = (() => {{\n{body}\nreturn {{ {exported} }};\n}})();\n"
+    for names, other in _IMPORT.findall(files[name]):
+        exports = _EXPORT.findall(files[other])
+        if other not in parts:
+            _add_imported(other, files, parts, (*above, name))
+            body = _body(other, files[other], keeps_exports=False)
+            text = f"{{\n{body}\nreturn {{ {', '.join(exports)} }};\n}}"
+            parts[other] = f"const {_variable(other)} = (() => {text})();\n"
+        wanted = {one.split(" as ")[0].strip() for one in names[1:-1].split(",")}
+        if missing := wanted - {"", *exports}:
+            text = f"{', '.join(sorted(missing))}, which {other} does not export by a line of its own"
+            raise ValueError(f"{name}: cannot be joined: it imports {text}")
 
 
 def _body(name: str, text: str, keeps_exports: bool) -> str:
+    if text.startswith("\ufeff"):
+        raise ValueError(f"{name}: cannot be joined: it begins with a byte order mark")
     text = _IMPORT.sub(lambda found: f"const {found[1].replace(' as ', ': ')} = {_variable(found[2])};", text)
     bare = _EXPORT.sub("", text)
     if other := _OTHER.search(bare):
@@ -63,4 +69,4 @@ def _body(name: str, text: str, keeps_exports: bool) -> str:
 
 
 def _variable(name: str) -> str:
-    return "module_" + name.removesuffix(".js").replace("-", "_")
+    return "module_" + name.removesuffix(".js").replace("-", "$")  # so that a-b.js is another than a_b.js

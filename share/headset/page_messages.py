@@ -108,14 +108,37 @@ PageMessage = PageHello | PagePing | PageRequest | PageCommand | PagePoints | Pa
 _decoder: msgspec.json.Decoder[PageMessage] = msgspec.json.Decoder(PageMessage)
 
 
+class OtherSchemaError(MessageError):
+    """A page speaks another schema: it was loaded before the edge's release was another."""
+
+
+class _AnyHello(Struct, tag_field="type", tag="hello"):
+    schema: int
+
+
+_hello_decoder = msgspec.json.Decoder(_AnyHello)
+
+
 def decode_page(data: str | bytes) -> PageMessage:
-    """Return the message of a page. Raises MessageError, with a line for a person."""
+    """Return the message of a page. Raises MessageError, with a line for a person; OtherSchemaError for a
+    hello of another schema."""
     try:
         return _decoder.decode(data)
     except msgspec.DecodeError as error:
+        if _is_of_another_schema(data):
+            raise OtherSchemaError(
+                "this page is of another release than the edge: load it again in the browser"
+            ) from None
         raise MessageError(f"not a message of this page: {error}"[:300]) from None
     except (ValueError, RecursionError):
         raise MessageError("not a message of this page") from None
+
+
+def _is_of_another_schema(data: str | bytes) -> bool:
+    try:
+        return _hello_decoder.decode(data).schema != SCHEMA
+    except (ValueError, RecursionError):  # msgspec.DecodeError too
+        return False
 
 
 def as_request(page: PageRequest, number: int) -> PutObject | RemoveObject:

@@ -49,10 +49,12 @@ async def end_page(seat: PageSeat, reason: str, is_over: bool) -> None:
     await refuse(seat.connection, reason, is_over)
 
 
-async def refuse(connection: Any, reason: str, is_over: bool = False) -> None:
-    """Say why a page is not served, and close. is_over: it shall forget its session."""
+async def refuse(connection: Any, reason: str, is_over: bool = False, is_outdated: bool = False) -> None:
+    """Say why a page is not served, and close. is_over: it shall forget its session; is_outdated: load itself
+    again."""
+    about = {"reason": reason, "is_over": is_over, "is_outdated": is_outdated}
     with contextlib.suppress(TimeoutError, ConnectionClosed):
         async with asyncio.timeout(CLOSE_S):
-            await connection.send(page.encode_page({"type": "refused", "reason": reason, "is_over": is_over}))
+            await connection.send(page.encode_page({"type": "refused", **about}))
             await connection.close(1008)
     connection.transport.abort()

@@ -24,7 +24,7 @@ from websockets.http11 import Response
 
 from share.errors import ShareError
 from share.headset import page_messages as page
-from share.headset.certificate import PageCertificate
+from share.headset.certificate import PageCertificate, session_key
 from share.headset.measures import MeasureTable, ServerReport, encode_report, measured_fields
 from share.headset.mounts import ViewerMount
 from share.headset.page_requests import FOLDER, PageAnswer, PageGuard, own_names, read_page
@@ -60,15 +60,14 @@ _MAX_MOVES = 32  # of maps, that a page was told
 @dataclass(frozen=True)
 class HeadsetSettings:
     """What the server is started with. certificate: None: plain HTTP, of this machine alone. host: that it
-    listens on. endpoint: the address and port to which sessions are bound. session_key: that signs them.
-    sessions: the folder that says which ones are the newest. began_s: when the page began, monotonic. table:
+    listens on. endpoint: the address and port to which sessions are bound. sessions: the folder with the key
+    that signs them and what says which ones are the newest. began_s: when the page began, monotonic. table:
     where what pages measure is written. folder: with the page's files."""
 
     access: EdgeAccess
     host: str
     endpoint: str
     certificate: PageCertificate | None
-    session_key: bytes = field(repr=False)
     sessions: Path
     began_s: float
     mounts: dict[str, ViewerMount] = field(default_factory=dict)
@@ -90,7 +89,7 @@ class HeadsetServer:
         self._room = SharedRoom()
         self._wearers = WearerRegistry(
             settings.access,
-            settings.session_key,
+            session_key(settings.sessions),  # as it is now: whoever removes it has all pair anew
             SessionLedger(settings.endpoint, settings.sessions),
             self._notify,
             self._dismiss,
@@ -251,7 +250,8 @@ class HeadsetServer:
             connection.transport.abort()
             return
         except (PairingError, page.MessageError) as error:
-            await refuse(connection, str(error), isinstance(error, SessionOverError))
+            is_outdated = isinstance(error, page.OtherSchemaError)
+            await refuse(connection, str(error), isinstance(error, SessionOverError), is_outdated)
             return
         self._connections.leave(connection)  # its place is its own from now on
         seat, taken_over = PageSeat(connection, rights), wearer.seat

@@ -294,10 +294,8 @@ class WearerRegistry:
             raise PairingError(f"{MAX_WEARERS} wearers are here already")
         try:
             self._ledger.note(session)
-        except (ShareError, OSError) as error:
-            self._notify(
-                f"headset page: {error}: after a start of the edge, sessions that are over may be good again"
-            )
+        except ShareError as error:
+            self._notify(f"headset page: {error}")
         name, access = session.name, self._access
         wearer = Wearer(session, lambda tell: WearerLink(access.address, name, access.keys_of(name), tell))
         self._wearers[name] = wearer
@@ -322,6 +320,8 @@ class WearerRegistry:
         """Return what a wearer may do by now. Raises PairingError if it may be here no more, ListDamagedError
         where that is not known."""
         check_end(wearer.session, moment_now())
+        if not self._ledger.is_newest(wearer.session):  # by another edge of this address
+            raise _replaced(wearer.name)
         return self._access.rights_of(wearer.name)
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import re
 import ssl
 import subprocess
 import sys
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -14,6 +15,8 @@ import pytest
 
 from share.errors import UsageError
 from share.headset.certificate import _key_fault, given_certificate, own_certificate, session_key
+from share.headset.headset_page import HeadsetPage
+from share.headset.wearers import EdgeAccess
 
 needs_cryptography = pytest.mark.skipif(
     subprocess.run([sys.executable, "-c", "import cryptography"], capture_output=True).returncode != 0,
@@ -46,6 +49,34 @@ def test_one_that_is_over_is_made_anew_and_a_given_one_refused(tmp_path: Path) -
         UsageError, match=r"--headset-cert .*: it was valid until 20\d\d-\d\d-\d\d; give a newer"
     ):
         given_certificate(*given)
+
+
+@needs_cryptography
+def test_one_that_is_not_valid_yet_is_made_anew_and_a_given_one_refused(tmp_path: Path) -> None:
+    now = datetime.now(UTC)
+    early = own_certificate(tmp_path, "::1", now + timedelta(days=30))
+    with pytest.raises(
+        UsageError,
+        match=r"--headset-cert .*: it is valid from 20\d\d-\d\d-\d\d \d\d:\d\d UTC on; give another",
+    ):
+        given_certificate(early.certificate, early.key, now)
+    assert given_certificate(early.certificate, early.key, now + timedelta(days=30)) == early
+    assert own_certificate(tmp_path, "::1").fingerprint != early.fingerprint
+
+
+@needs_cryptography
+def test_one_that_ends_within_a_day_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    pytest.importorskip("websockets")
+    (tmp_path / "index.html").write_text("x")
+    for age, is_said in ((timedelta(days=729, hours=2), True), (timedelta(days=728), False)):
+        own = own_certificate(tmp_path / str(is_said), "::1", datetime.now(UTC) - age)
+        told: list[str] = []
+        given = {"certificate": own.certificate, "key": own.key, "folder": tmp_path}
+        with closing(
+            HeadsetPage("127.0.0.1:0", EdgeAccess("tcp://127.0.0.1:1"), notify=told.append, **given)  # type: ignore[arg-type]
+        ):
+            assert [line for line in told if "its certificate ends at" in line] == told[:1] * is_said
 
 
 @needs_cryptography

@@ -134,6 +134,7 @@ def test_nothing_is_said_before_a_code(fresh: HeadsetPage) -> None:
             "type": "refused",
             "reason": "a page begins with hello",
             "is_over": False,
+            "is_outdated": False,
         }
         assert stranger.is_closed()
     used = code(fresh)
@@ -141,10 +142,19 @@ def test_nothing_is_said_before_a_code(fresh: HeadsetPage) -> None:
     for wrong in ({"code": used, "name": "bob"}, {"session": "A" * 64}):  # replayed; forged
         with PageClient(fresh.endpoint) as stranger:
             answer = stranger.hello(**wrong)
-            assert answer["type"] == "refused" and list(answer) == ["type", "reason", "is_over"]
+            assert answer["type"] == "refused" and set(answer) == {"type", "reason", "is_over", "is_outdated"}
             assert answer["is_over"] == ("session" in wrong)
             assert stranger.is_closed() and len(stranger.seen) == 1
     assert code(fresh) != used
+
+
+def test_a_page_of_another_release_is_told_to_load_itself_again(fresh: HeadsetPage) -> None:
+    with PageClient(fresh.endpoint) as old:
+        old.send(type="hello", schema=2, session="x", further=[1])
+        answer = old.hear()
+        assert answer["is_outdated"] and not answer["is_over"]
+        assert answer["reason"].startswith("this page is of another release than the edge: load it again")
+        assert old.is_closed()
 
 
 def test_a_code_is_not_used_up_by_a_name_that_is_none(fresh: HeadsetPage) -> None:
@@ -535,6 +545,37 @@ def test_a_session_that_is_over_stays_so_after_a_start(site: Path, edge: RoomSer
                 said = one.hello(session=session)
                 assert said["type"] == answer
                 assert answer == "welcome" or (said["is_over"] and "another headset" in said["reason"])
+
+
+def test_who_removes_what_sessions_are_signed_with_has_all_pair_anew(
+    site: Path, edge: RoomServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the edge advises where the ledger is damaged: also while it runs, from the page's next start on."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    told: list[str] = []
+    with closing(serve(site, edge.address, notify=told.append)) as page:
+        sessions = []
+        for _ in range(2):
+            with paired(page, "ann") as ann:
+                sessions.append(ann.seen[0]["session"])
+            assert soon(lambda: not page.report()["wearers"].get("ann", {"is_connected": 0})["is_connected"])
+        (default_folder() / LEDGER_FILE).write_text("[{")
+        with paired(page, "bob"):
+            pass
+        assert any("as it is, the page cannot start again" in line for line in told)
+        os.kill(page.pid or 0, signal.SIGKILL)
+        assert soon(lambda: any("has ended (LedgerDamagedError: " in line for line in told))
+        for name in (LEDGER_FILE, "headset.secret"):
+            (default_folder() / name).unlink()
+
+        def back() -> Any:
+            with suppress(OSError):
+                return PageClient(page.endpoint)
+
+        for session in sessions:
+            with soon(back) as again:
+                said = again.hello(session=session)
+                assert said["is_over"] and "not known here" in said["reason"]
 
 
 def test_two_edges_of_a_machine_have_sessions_of_their_own(site: Path, edge: RoomServer) -> None:

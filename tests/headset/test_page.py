@@ -68,7 +68,7 @@ def test_a_part_that_does_not_come_is_said_and_loaded_again(chromium: Browser, r
     said = "(document.querySelector('#loading p')?.textContent ?? '')"
     page.open(room.url)
     page.wait_for(f"{said}.startsWith('A part of this page did not come') && {said}.includes('again in 9 s')")
-    assert page.evaluate("sessionStorage.getItem('share-loads')") == "3"  # it has loaded itself twice
+    assert page.evaluate("sessionStorage.getItem('share-loads')") == "2"  # it has loaded itself twice
     page.call("Network.setBlockedURLs", urls=[])
     page.wait_for("document.getElementById('loading') === null")  # and once more
     page.wait_for(
@@ -143,3 +143,21 @@ def test_a_lost_server_comes_back_and_nothing_is_lost(chromium: Browser, room: H
     room.drop()
     page.wait("!app.connection.isPaired && !document.getElementById('start').hidden")
     assert "pair again" in page.app("document.getElementById('reason').textContent")
+
+
+def test_a_page_of_another_release_loads_itself_again_once(chromium: Browser, room: HeadsetRoom) -> None:
+    page = chromium.page(room.url)
+    worn.pair(page, "ann")
+    page.wait("app.connection.isConnected")
+    page.evaluate("(window.isOld = true, 0)")
+    room.hindrance, room.is_outdated = "this page is of another release", True
+    room.drop()
+    page.wait_for("window.isOld === undefined && sessionStorage.getItem('share-outdated') === '1'")
+    page.wait("app.connection.text.includes('another release')")  # it is no other one: it tries later
+    page.evaluate("(window.isOld = true, 0)")
+    room.hindrance = "it still is"
+    page.wait("app.connection.text === 'it still is'", 20)
+    assert page.app("window.isOld && app.connection.isPaired")
+    room.hindrance = ""
+    page.wait("app.connection.isConnected && app.wearer === 'ann'", 20)  # by the session that it kept
+    assert page.evaluate("sessionStorage.getItem('share-outdated')") is None

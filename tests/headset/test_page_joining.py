@@ -22,7 +22,7 @@ def test_the_page_is_two_files_and_its_policy_knows_what_is_in_them() -> None:
     ]
     for name in PAGE:
         if name.endswith(".js") and name not in ("main.js", "loading.js"):
-            assert module.count(f"const module_{name[:-3].replace('-', '_')} = ") == 1
+            assert module.count(f"const module_{name[:-3].replace('-', '$')} = ") == 1
     policy = PageGuard("https", (), files).headers("127.0.0.1")["Content-Security-Policy"]
     for kind in ("script", "style"):
         assert re.search(rf"{kind}-src 'self' 'sha256-[A-Za-z0-9+/]{{43}}=';", policy)
@@ -39,9 +39,9 @@ def test_a_module_comes_after_what_it_imports_once() -> None:
     assert joined_module("main.js", files) == (
         "const module_z = (() => {\nconst hidden = 2;\nclass Z {}\nconst z = hidden;\n"
         "\nreturn { Z, z };\n})();\n"
-        "const module_x_y = (() => {\nconst { z } = module_z;\nconst hidden = 1;\n"
+        "const module_x$y = (() => {\nconst { z } = module_z;\nconst hidden = 1;\n"
         "function a() { return z; }\n\nreturn { a };\n})();\n"
-        "const { a: b } = module_x_y;\nconst { z } = module_z;\nexport const c = b + z;\n"
+        "const { a: b } = module_x$y;\nconst { z } = module_z;\nexport const c = b + z;\n"
     )
 
 
@@ -64,6 +64,30 @@ def test_what_is_not_known_is_not_guessed(text: str) -> None:
         joined_module("one.js", {"one.js": text, "z.js": ""})
     with pytest.raises(ValueError, match="imports itself"):
         joined_module("a.js", {"a.js": 'import { b } from "./b.js";', "b.js": 'import { a } from "./a.js";'})
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("export const b = 1, a = 2;", r"it imports a, which z\.js does not export"),
+        ("export const b = 1;", r"it imports a, which z\.js does not export"),
+        ("export class a$ {}", r"z\.js: cannot be joined: export class a\$"),
+        ("\ufeffexport const a = 1;", r"z\.js: cannot be joined: it begins with a byte order mark"),
+    ],
+)
+def test_what_would_be_undefined_is_said(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        joined_module("one.js", {"one.js": 'import { a as c } from "./z.js";', "z.js": text})
+
+
+def test_modules_with_names_alike_stay_apart() -> None:
+    files = {
+        "main.js": 'import { a } from "./a-b.js";\nimport { b } from "./a_b.js";\n',
+        "a-b.js": "export const a = 1;\n",
+        "a_b.js": "export const b = 1;\n",
+    }
+    names = re.findall(r"^const (module_\S+) = ", joined_module("main.js", files), re.MULTILINE)
+    assert len(set(names)) == 2
 
 
 def test_style_and_small_scripts_are_in_the_html() -> None:

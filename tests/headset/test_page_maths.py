@@ -237,3 +237,53 @@ def test_a_jump_eases_at_the_wearer_and_is_said(modules: BrowserPage) -> None:
     steps = np.linalg.norm(np.diff(drawn[2:], axis=0), axis=1)
     assert np.allclose(drawn[-1], after, atol=1e-3) and steps.max() < 0.2 * 1.6 * 11 / 500
     assert any("20.0 cm" in text and "0.5 s" in text for text in told)
+
+
+def test_what_is_followed_does_not_flap_where_poses_are_as_old_as_they_may_be(modules: BrowserPage) -> None:
+    """Frames at 72 Hz for 20 s, poses at 30 Hz that arrive late; follow is wanted after 1 s."""
+    stamps = np.arange(600) * 100 / 3
+    inside = (stamps > 5000) & (stamps < 6500)
+    found = run(
+        modules,
+        "placement",
+        """lates.map((late) => {
+            const placement = new m.Placement(), words = new Set();
+            placement.setMount(null, 0);
+            const T = Float64Array.from({ length: 16 }, (_, k) => (k % 5 === 0 ? 1 : 0));
+            const cov = Float64Array.from({ length: 36 }, (_, k) => (k % 7 === 0 ? 1e-6 : 0));
+            const poses = stamps.map((timeMs, k) => ({ timeMs, atMs: timeMs + late[k] }));
+            let flips = 0, wasHeld = null;
+            for (let frame = 0; frame < 72 * 20; frame++) {
+                const timeMs = (1000 * frame) / 72;
+                if (frame === 72) placement.setMode("follow");
+                for (const one of poses.filter(({ atMs }) => atMs <= timeMs)) {
+                    placement.addPose({ timeMs: one.timeMs, mapId: "a", T_map_body: T, cov });
+                    one.atMs = Infinity;
+                }
+                placement.update(timeMs, T);
+                if (frame < 72) continue;
+                if (wasHeld !== null && placement.isHeld !== wasHeld) flips++;
+                wasHeld = placement.isHeld;
+                if (wasHeld) words.add(placement.whyHeld(timeMs));
+            }
+            return [flips, wasHeld, [...words].sort()];
+        })""",
+        stamps=stamps.tolist(),
+        lates=[
+            late.tolist()
+            for late in (
+                np.full(600, 50.0),
+                970 + 20 * np.sin(stamps),  # as old as they may be, and often older
+                np.full(600, 1200.0),
+                np.where(inside, 1e9, 50.0),  # none for 1.5 s
+                np.maximum(1300 - stamps % 2000, 50),  # a stall of 1.3 s every 2 s
+                np.where(stamps > 5000, 1e9, 50.0),
+            )
+        ],
+    )
+    was, are = (f"poses {one} over 1 s old" for one in ("were", "are"))
+    steady, edgy, old, gap, stalls, ended = found
+    assert steady == [0, False, []] and ended == [1, True, ["no new pose"]]
+    assert edgy == [1, True, [are, was]] and old == [0, True, ["no new pose", are]]  # until the first
+    assert gap == [2, False, ["no new pose", was]]
+    assert stalls[:2] == [0, True]

@@ -57,7 +57,8 @@ def test_what_no_room_has_is_refused_with_the_reason(change: dict[str, Any], rea
 
 BAD: list[str | bytes] = [
     *("", "null", "{}", "[]", "1", '"x"', "[" * 9000, '{"type":"hello"', b"\xff\xfe", b"\0" * 100),
-    '{"type":"hello","schema":2,"code":"1"}',
+    '{"type":"hello","schema":1,"code":1}',
+    '{"type":"hello","schema":"2","code":"1"}',
     '{"type":"welcome"}',
     json.dumps(PUT).replace("2.5", "NaN"),
     json.dumps(PUT).replace("2.5", "1e999"),
@@ -79,6 +80,14 @@ def test_what_is_malformed_is_one_line(data: str | bytes) -> None:
         page.decode_page(data)
     assert str(refused.value).startswith("not a message of this page")
     assert "\n" not in str(refused.value) and len(str(refused.value)) <= 300
+
+
+@pytest.mark.parametrize(
+    "data", ['{"type":"hello","schema":2,"code":"1"}', '{"schema":0,"type":"hello","name":[]}']
+)
+def test_a_hello_of_another_schema_says_what_to_do(data: str) -> None:
+    with pytest.raises(page.OtherSchemaError, match=r"^this page is of another release .*: load it again"):
+        page.decode_page(data)
 
 
 def mutated(draw: random.Random) -> bytes:

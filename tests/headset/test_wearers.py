@@ -32,6 +32,24 @@ def test_twelve_hours_end_also_for_a_page_that_stays() -> None:
         registry(access).rights_now(wearer("ann", -1.0))
 
 
+def test_a_session_that_another_edge_of_the_address_ends_is_over_here_too(tmp_path: Path) -> None:
+    desks = [
+        WearerRegistry(
+            EdgeAccess("tcp://127.0.0.1:1"), bytes(32), SessionLedger("a:1", tmp_path), *[lambda *_: None] * 2
+        )
+        for _ in "ab"
+    ]
+    here = SimpleNamespace(name="ann", session=SessionLedger("a:1").new_session("ann", None, moment_now()))
+    assert desks[0].rights_now(here) == frozenset()  # type: ignore[arg-type]
+    there = SessionLedger("a:1", tmp_path)
+    there.note(here.session)
+    assert desks[0].rights_now(here) == frozenset()  # type: ignore[arg-type]
+    there.note(there.new_session("ann", None, moment_now()))
+    for desk in desks:
+        with pytest.raises(SessionOverError, match="another headset has paired as 'ann' since"):
+            desk.rights_now(here)  # type: ignore[arg-type]
+
+
 def test_rights_are_as_the_list_says_now(tmp_path: Path) -> None:
     public = generate_pair(tmp_path / "ann", "ann").public
     one = registry(EdgeAccess("tcp://127.0.0.1:1", frozenset(Permission), tmp_path))

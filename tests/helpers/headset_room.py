@@ -36,6 +36,7 @@ class HeadsetRoom:
         self.received = list[dict[str, Any]]()  # of pages; with the moment, ns
         self.map_id, self.delay_s, self.refusal = MAP, 0.012, ""
         self.hindrance = ""  # why nobody is let in for now
+        self.is_outdated = False  # whether that is the page's release
         self.mount: F64 | None = None
         self.may = {"objects": True, "commands": True}
         self.paths: dict[str, list[list[float]]] = {}
@@ -106,7 +107,8 @@ class HeadsetRoom:
     def _serve(self, connection: ServerConnection) -> None:
         hello = json.loads(connection.recv())
         if self.hindrance:
-            refused = {"type": "refused", "reason": self.hindrance, "is_over": False}
+            about = {"is_over": False, "is_outdated": self.is_outdated}
+            refused = {"type": "refused", "reason": self.hindrance, **about}
             connection.send(json.dumps(refused))
             return
         if "session" in hello and hello["session"] in self._names:

@@ -9,6 +9,7 @@ const PING_MS = 1000;
 const FIRST_PINGS = 5;  // in quick succession, for the clock
 const SILENT_MS = 3500;  // without any message the connection counts as lost
 const SECRET = "share-session";  // in sessionStorage: a page that is loaded again goes on
+const OUTDATED = "share-outdated";  // in sessionStorage: it has loaded itself again, for an edge of another release
 
 export class Connection {
     clock = new ServerClock();
@@ -147,6 +148,7 @@ export class Connection {
                 break;
             case "refused":
                 if (this.isPaired && !message.is_over) {
+                    if (message.is_outdated && this.#renew()) return;
                     this.#tryLater(message.reason);
                     return;
                 }
@@ -167,6 +169,7 @@ export class Connection {
 
     #onWelcome(welcome) {
         sessionStorage.setItem(SECRET, welcome.session);
+        sessionStorage.removeItem(OUTDATED);
         this.#hello = { session: welcome.session };
         this.isPaired = this.isConnected = true;
         this.#waitMs = FIRST_WAIT_MS;
@@ -175,6 +178,15 @@ export class Connection {
         this.clock.forget();
         for (let k = 0; k < FIRST_PINGS; k++) this.#timers.push(setTimeout(() => this.#ping(), 60 * k));
         for (const message of this.#pending.values()) this.#send(message);
+    }
+
+    // Take the page of the edge as it is now, which goes on with the session; once, else it would do so for ever.
+    #renew() {
+        if (sessionStorage.getItem(OUTDATED) !== null) return false;
+        this.#leave();
+        sessionStorage.setItem(OUTDATED, "1");
+        location.reload();
+        return true;
     }
 
     // The session stays: what hinders it may pass.

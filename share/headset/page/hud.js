@@ -40,7 +40,7 @@ function alignmentLine({ placement, room, alignmentMm, driftMmS }) {
     if (placement.mapId === null) return ["finding this headset in the map", BAD];
     const mount = placement.isCalibrated ? "" : ", mount not calibrated";
     const drift = driftMmS === null ? "" : `, drift ${driftMmS.toFixed(1)} mm/s`;
-    const mode = placement.isHeld ? "follow: no new pose, held" : placement.mode;
+    const mode = placement.isHeld ? `follow: ${placement.whyHeld(performance.now())}, held` : placement.mode;
     return [`${mode} ±${(alignmentMm ?? 0).toFixed(0)} mm${drift}${mount}`, mount || placement.isHeld ? BAD : DIM];
 }
 

@@ -11,6 +11,8 @@ import { ViewerHistory } from "./viewer-history.js";
 
 export const EASE_MS = 500;
 const MAX_AGE_MS = 1000;  // of a pose that is followed
+const [AGAIN_AGE_MS, AGAIN_MS] = [700, 2000];  // once one was older: of all poses, for so long, until they are followed again
+const NEWS_MS = 500;  // without another pose none comes
 const MAX_WAITING = 8;  // poses that are newer than the viewer's
 const MAX_TIMESHIFT_MS = 200;  // of a mount; beyond, its recording was of clocks that have nothing in common
 const JUDGED = 100;  // pairs, by which the mount is judged
@@ -34,6 +36,7 @@ export class Placement {
     history = new ViewerHistory();
     #pose = null;  // the newest of the own device, {timeMs, mapId, T_map_body, cov, velocity, angularVelocity}
     #waiting = [];
+    #poses = { heardMs: -Infinity, last: null, youngSinceMs: null, areOld: false };  // of the own device, frame by frame
     #hasJumped = null;  // why
     #ease = null;  // {xi, beganMs}
     #refused = [];
@@ -60,11 +63,18 @@ export class Placement {
 
     setMode(mode) {
         this.mode = mode;
+        this.#poses.areOld = false;
     }
 
-    // Whether the wearer wants to follow poses of which no new one comes.
+    // Whether the wearer wants to follow poses, and none is new enough.
     get isHeld() {
         return this.mode === "follow" && !this.isFollowing;
+    }
+
+    // Why, in words.
+    whyHeld(nowMs) {
+        if (!(nowMs - this.#poses.heardMs <= NEWS_MS)) return "no new pose";
+        return `poses ${this.poseAgeMs(nowMs) > MAX_AGE_MS ? "are" : "were"} over 1 s old`;
     }
 
     // A pose of the own device; timeMs: of its stamp on the page's clock.
@@ -163,11 +173,23 @@ export class Placement {
     }
 
     #chooseWay(timeMs) {
-        const isFollowing = this.mode === "follow" && this.#pose !== null && timeMs - this.#pose.timeMs <= MAX_AGE_MS;
+        this.#judgeAge(timeMs);
+        const isFollowing = this.mode === "follow" && !this.#poses.areOld;
         if (isFollowing === this.isFollowing) return;
         this.isFollowing = isFollowing;
         if (isFollowing) this.#hasJumped = "drawn by SHARE's newest pose";
-        else this.#hasJumped = `${this.isHeld ? "no new pose: " : ""}drawn by the headset's tracking`;
+        else this.#hasJumped = `${this.isHeld ? `${this.whyHeld(timeMs)}: ` : ""}drawn by the headset's tracking`;
+    }
+
+    // Poses that are about as old as they may be would else be followed and not, in turns.
+    #judgeAge(timeMs) {
+        const [poses, pose] = [this.#poses, this.#pose];
+        if (pose !== poses.last) [poses.last, poses.heardMs] = [pose, timeMs];
+        const ageMs = pose === null ? Infinity : timeMs - pose.timeMs;
+        if (ageMs > AGAIN_AGE_MS) poses.youngSinceMs = null;
+        else poses.youngSinceMs ??= timeMs;
+        const areYoung = poses.youngSinceMs !== null && timeMs - poses.youngSinceMs >= AGAIN_MS;
+        poses.areOld = poses.areOld ? !areYoung : ageMs > MAX_AGE_MS;
     }
 
     #align() {
