@@ -1,9 +1,9 @@
 """What an edge says of its policy in a blind study: the letter of the condition, and nothing else.
 
 All that an edge tells of itself comes from its report (edge.json, /snapshot.json, /metrics, the pages) and
-from its events (events.jsonl, the terminal, the live room), which are covered here. Its configuration is shown
-as a digest, salted so that no list of guesses finds it. What only some policies have or do is left out under
-all of them: rates and their targets, loops that a gate leaves out, and that a policy finds the air full.
+from its events (events.jsonl, the terminal, the live room), which are covered here. Its configuration is
+shown as a digest, salted so that no list of guesses finds it. What only some policies have or do is left out
+under all: rates and their targets, loops that a gate leaves out, and that a policy finds the air full.
 """
 
 from __future__ import annotations
