@@ -323,6 +323,25 @@ def test_a_robot_that_does_not_come_and_no_marker(share: Any, address: str) -> N
     assert stands["path_m"] == 0.0
 
 
+def test_a_bridge_that_dies_and_a_terminal_that_ends(share: Any, address: str) -> None:
+    plan(share, spots=1)
+    with StudyActors(address, speed_m_s=0.02) as actors, RunningStudy(address) as study:
+        study.begin("1 of 1:")
+        study.call()
+        until(lambda: any(one["event"] == "moves" for one in events("p01-1")))
+        actors.is_bridge_dead = True
+        assert study.end() == 1
+        (said,) = [line for line in study.said.splitlines() if line.startswith("share: ")]
+        assert "p01, trial 1: the robot is gone: its bridge is silent" in said
+    assert [one["event"] for one in events("p01-1")] == ["begin", "call", "moves", "interrupted"]
+    with RunningStudy(address, "--resume") as study:
+        assert study.process.stdin is not None
+        study.process.stdin.close()
+        assert study.end() == 1
+        (said,) = [line for line in study.said.splitlines() if line.startswith("share: ")]
+        assert "stdin has ended, so nobody can press Enter" in said
+
+
 def until(is_so: Any) -> None:
     end_s = time.monotonic() + _WAIT_S
     while not is_so():
