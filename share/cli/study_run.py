@@ -104,7 +104,11 @@ def _locked(trials: Path) -> int:
     from share.files.locks import lock_handle
     from share.files.writing import writable_dir
 
-    handle = os.open(writable_dir(trials), os.O_RDONLY)
+    try:
+        folder = writable_dir(trials)
+    except UsageError as error:  # `run` has no --out
+        raise UsageError(f"{str(error).removesuffix('; give another --out')}; let it be written to") from None
+    handle = os.open(folder, os.O_RDONLY)
     try:
         lock_handle(handle)
     except BlockingIOError:
@@ -132,8 +136,8 @@ class TerminalResearcher:
     """Who leads the trials, at this terminal: lines of stdin, and stderr."""
 
     def __init__(self, stderr: Stderr) -> None:
-        self._stderr, self._lines = stderr, queue.SimpleQueue[str]()
-        self._has_ended = False
+        self._stderr, self._lines = stderr, queue.SimpleQueue[str | None]()  # None: no line follows
+        self._has_ended, self._reason = False, "ended by the researcher"
         threading.Thread(target=self._read, name="stdin", daemon=True).start()
 
     def say(self, text: str) -> None:
@@ -144,20 +148,29 @@ class TerminalResearcher:
             line = self._lines.get_nowait()
         except queue.Empty:
             return None
-        if line.strip().lower() == "q":
-            self.end()
-            return None
-        return line
+        return None if self._ends(line) else line
 
     def forget_typed(self) -> None:
         with contextlib.suppress(queue.Empty):
-            while self._lines.get_nowait().strip().lower() != "q":
+            while not self._ends(self._lines.get_nowait()):
                 pass
-            self.end()
+
+    def _ends(self, line: str | None) -> bool:
+        """Return whether a line ends it; if so, it does."""
+        if line is None:
+            self._reason = "stdin has ended, so nobody can press Enter: give it a terminal"
+        elif line.strip().lower() != "q":
+            return False
+        self.end()
+        return True
 
     @property
     def wants_end(self) -> bool:
         return self._has_ended
+
+    @property
+    def end_reason(self) -> str:
+        return self._reason
 
     def end(self) -> None:
         self._has_ended = True
@@ -170,3 +183,4 @@ class TerminalResearcher:
                 *lines, rest = (rest + data).split(b"\n")
                 for line in lines:
                     self._lines.put(line.decode(errors="replace").rstrip("\r"))
+        self._lines.put(None)

@@ -141,7 +141,10 @@ class EdgeRun:
         finally:
             self.close()
             self._try_to_report()
-            self._report["series"] = self._state_machine.series()
+            series = self._state_machine.series()
+            self._report["series"] = (
+                series if self._blinding is None else self._blinding.covered_series(series)
+            )
             self._files.finish(self._report)
             self._discard_answers()
             self._files.check()
@@ -342,6 +345,11 @@ class EdgeRun:
             self._execute(effect)
 
     def _execute(self, effect: EdgeEffect) -> None:
+        if isinstance(effect, WriteEvent) and self._blinding is not None:
+            fields = self._blinding.covered_event(effect.fields)
+            if fields is None:
+                return
+            effect = WriteEvent(fields)
         self._observer.add_effect(effect)
         match effect:
             case SendToPeer():

@@ -5,7 +5,9 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,9 @@ from helpers.shell import Done
 from helpers.study_folder import begin, fill, goal_events, write_lines
 
 from share.cli.blind_edge import edge_settings
+from share.cli.stderr import Stderr
+from share.cli.study_run import TerminalResearcher
+from share.errors import UsageError
 from share.lab.study.plan import StudyKey, read_key, read_plan, sealed_settings
 from share.lab.study.trials import trial_folder
 
@@ -122,6 +127,42 @@ def test_a_trial_that_is_left_is_marked_and_not_asked_about(study: Run) -> None:
     assert events[-1]["is_left"] and events[-1]["t_s"] == 14.0
     done = study("s", "--", "--map", "/dev/null/x")
     assert "p01, trial 2 of 4" in done.err and "was interrupted" not in done.err
+
+
+def test_a_read_only_folder_is_one_line_without_an_option_of_others(
+    study: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, *names: str) -> Path:
+        raise UsageError(f"{path}: cannot be written to: Permission denied; give another --out")
+
+    monkeypatch.setattr("share.files.writing.writable_dir", refuse)
+    done = study("s")
+    assert done.code == 2 and "--out" not in done.err
+    assert "s/trials: cannot be written to: Permission denied; let it be written to" in done.err
+
+
+def test_a_broken_key_does_not_tell_its_policies(study: Run, share: Run) -> None:
+    text = Path("s-key.json").read_text()
+    Path("s-key.json").write_text(text.replace('"covins-g"', '"covins-h"'))
+    done = share("edge", "--bind", "tcp://127.0.0.1:0", "--blind", "s-key.json:A")
+    assert done.code == 2 and done.err.count("\n") == 1
+    assert "covins" not in done.err and "its policy is not known" in done.err
+
+
+def test_the_end_of_stdin_is_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    os.write(write, b"first\n")
+    os.close(write)
+    with os.fdopen(read) as stdin, closing(Stderr()) as stderr:
+        monkeypatch.setattr("sys.stdin", stdin)
+        terminal = TerminalResearcher(stderr)
+        typed = []
+        end_s = time.monotonic() + 60
+        while not terminal.wants_end and time.monotonic() < end_s:
+            typed.append(terminal.poll())
+            time.sleep(0.01)
+    assert "first" in typed and terminal.wants_end
+    assert terminal.end_reason == "stdin has ended, so nobody can press Enter: give it a terminal"
 
 
 # ---------------------------------------------------------------- share edge --blind

@@ -67,7 +67,7 @@ class StudyActors:
 
     def __init__(self, address: str, speed_m_s: float = 3.0, reaches: bool = True) -> None:
         self.address, self.speed_m_s, self.reaches = address, speed_m_s, reaches
-        self.at = in_map(2.0, 2.0)
+        self.at, self.is_bridge_dead = in_map(2.0, 2.0), False
         self._ended = threading.Event()
         self._threads = [threading.Thread(target=self._agent, args=(name,)) for name in _KINDS]
         self._threads.append(threading.Thread(target=self._robot))
@@ -114,7 +114,7 @@ class StudyActors:
         goal: Goto | None = None
         final: dict[int, CommandState] = {}
         told_s = stepped_s = time.monotonic()
-        while not self._ended.is_set():
+        while not (self._ended.is_set() or self.is_bridge_dead):
             for effect in link.step(20):
                 if not isinstance(effect, RobotCommanded):
                     continue

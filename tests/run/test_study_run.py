@@ -23,6 +23,7 @@ from helpers.study_actors import MARKER, StudyActors, in_map, study_map
 from share.child_processes import child_environment
 from share.config import POLICY_NAMES
 from share.lab.study.plan import StudyPlan, read_plan
+from share.lab.study.trial_machine import PRESS_AFTER_S
 
 pytestmark = pytest.mark.long
 _WAIT_S = 240.0  # on a busy machine
@@ -84,6 +85,11 @@ class RunningStudy:
         assert self.process.stdin is not None
         self.process.stdin.write(f"{text}\n".encode())
         self.process.stdin.flush()
+
+    def call(self) -> None:
+        """Send the robot; an Enter right after the spot was shown calls nothing."""
+        time.sleep(PRESS_AFTER_S + 0.2)
+        self.type()
 
     def end(self) -> int:
         return self.process.wait(_WAIT_S)
@@ -161,7 +167,7 @@ def test_a_participant_from_plan_to_report(share: Any, address: str) -> None:
                     assert shown is not None and shown.owner == "study"
                     np.testing.assert_allclose(shown.T_map_object[:2, 3], in_map(x, y), atol=1e-6)
                 else:
-                    study.type()
+                    study.call()
                 study.wait("reached after")
             study.wait("questions are on the page")
             page = re.findall(r"questions at (http://\S+)", study.said)[-1].rstrip("/")
@@ -225,7 +231,7 @@ def test_the_policies_of_two_trials_cannot_be_told_apart_by_name(share: Any, add
             with RunningStudy(address) as study:
                 study.begin("1 of 1: spot 1")
                 pages.append(fetched(study))
-                study.type()
+                study.call()
                 for _ in range(2):
                     study.wait("1 to 10")
                     study.type("5")
@@ -254,10 +260,10 @@ def test_a_study_that_is_killed_in_mid_trial_goes_on(share: Any, address: str) -
         with RunningStudy(address) as study:
             study.begin("1 of 3:")
             actors.speed_m_s = 5.0
-            study.type()
+            study.call()
             study.wait("2 of 3:")
             actors.speed_m_s = 0.05
-            study.type()
+            study.call()
             at = Path("s/trials/p01-1/events.jsonl")
             until(lambda: '"goal": 2' in at.read_text())
             study.process.send_signal(signal.SIGKILL)
@@ -271,7 +277,7 @@ def test_a_study_that_is_killed_in_mid_trial_goes_on(share: Any, address: str) -
         actors.speed_m_s = 5.0
         with RunningStudy(address, "--resume") as study:
             study.begin(f"2 of 3: spot {trial.spots[1]},")
-            study.type()
+            study.call()
             study.wait("3 of 3:")
             edge = edge_process(study.process.pid)
             os.kill(edge, signal.SIGKILL)
@@ -280,7 +286,7 @@ def test_a_study_that_is_killed_in_mid_trial_goes_on(share: Any, address: str) -
             assert "p01, trial 1: the edge ended" in said and "run it again to go on" in said
         with RunningStudy(address, "--resume") as study:
             study.begin("3 of 3:")
-            study.type()
+            study.call()
             study.wait("1 to 10")
             study.type("q")
             assert study.end() == 1
@@ -307,7 +313,7 @@ def test_a_robot_that_does_not_come_and_no_marker(share: Any, address: str) -> N
         study.wait("no spot can be shown without the floor's one marker")
         share("marker", "put", 0, 0, "--id", MARKER, "--edge", address, "--name", "lead")
         study.begin("1 of 1:")
-        study.type()
+        study.call()
         study.wait("timed out after")
         study.wait("1 to 10")
         assert made.success.timeout_s == 1.0
@@ -315,6 +321,25 @@ def test_a_robot_that_does_not_come_and_no_marker(share: Any, address: str) -> N
     assert status["status"] == "timed out"
     (stands,) = [one for one in events("p01-1") if one["event"] == "stands"]
     assert stands["path_m"] == 0.0
+
+
+def test_a_bridge_that_dies_and_a_terminal_that_ends(share: Any, address: str) -> None:
+    plan(share, spots=1)
+    with StudyActors(address, speed_m_s=0.02) as actors, RunningStudy(address) as study:
+        study.begin("1 of 1:")
+        study.call()
+        until(lambda: any(one["event"] == "moves" for one in events("p01-1")))
+        actors.is_bridge_dead = True
+        assert study.end() == 1
+        (said,) = [line for line in study.said.splitlines() if line.startswith("share: ")]
+        assert "p01, trial 1: the robot is gone: its bridge is silent" in said
+    assert [one["event"] for one in events("p01-1")] == ["begin", "call", "moves", "interrupted"]
+    with RunningStudy(address, "--resume") as study:
+        assert study.process.stdin is not None
+        study.process.stdin.close()
+        assert study.end() == 1
+        (said,) = [line for line in study.said.splitlines() if line.startswith("share: ")]
+        assert "stdin has ended, so nobody can press Enter" in said
 
 
 def until(is_so: Any) -> None:

@@ -7,7 +7,7 @@ import io
 import math
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -93,7 +93,8 @@ def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
     judges = Counter(record.judge for record in records.values())
     far = _far_cubes(records.values(), plan, rule)
     done = sum(record.is_complete for record in records.values())
-    notes = (*_broken_note(records), *_repeated_note(repeated), *far, *_judge_notes(judges, statuses))
+    notes = (*_broken_note(records), *_repeated_note(repeated), *far, *_room_notes(records.values()))
+    notes = (*notes, *_judge_notes(judges, statuses))
     return Observations(
         tuple(people), plan.letters, measures | answers, places, choices, notes, places.size, done
     )
@@ -125,6 +126,34 @@ def _far_cubes(records: Iterable[TrialRecord], plan: StudyPlan, rule: SuccessRul
             f"{len(far)} of {len(goals)} cubes lay more than {rule.distance_m:g} m from their planned spot, "
             f"the farthest {distance_m:.2f} m from spot {spot}; the robot was sent to the cube"
         )
+
+
+def _room_notes(records: Collection[TrialRecord]) -> Iterable[str]:
+    """Say what was not as it should be in the room: cubes and the marker that moved, edges, checks."""
+    goals = sum(len(record.goals) for record in records)
+    if moved := sum(len(record.moved_cubes) for record in records):
+        yield (
+            f"{moved} of {goals} cubes were moved or removed after they had called; distances are to where "
+            "they lay at the call"
+        )
+    if floors := sum(record.moved_floors > 0 for record in records):
+        yield (
+            f"the floor's marker moved during {floors} of {len(records)} trials, by a hand or a correction "
+            "of the map; places before and after do not compare"
+        )
+    unwell = Counter(name for record in records for name in sorted(record.unwell))
+    if unwell:
+        trials = sum(bool(record.unwell) for record in records)
+        names = ", ".join(f"{name} {count}" for name, count in sorted(unwell.items()))
+        yield f"{trials} of {len(records)} trials were begun though not all was well: {names}"
+    for condition in sorted({record.condition for record in records}):
+        trials_seals = [record.seals for record in records if record.condition == condition and record.seals]
+        seals = set().union(*trials_seals)
+        if len(seals) > 1:
+            yield (
+                f"THE EDGE'S CONFIGURATION CHANGES within condition {condition}: {len(seals)} of them in "
+                f"{len(trials_seals)} trials"
+            )
 
 
 def _judge_notes(judges: Mapping[str, int], statuses: Mapping[str, int]) -> Iterable[str]:

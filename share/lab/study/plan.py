@@ -145,7 +145,7 @@ class StudyKey:
     def __post_init__(self) -> None:
         for letter, name in self.policies.items():
             if name not in POLICY_NAMES:
-                raise ValueError(f"{letter}: policy '{name}' is not known; known: {', '.join(POLICY_NAMES)}")
+                raise ValueError(f"{letter}: its policy is not known")  # nor told: a study may be blind
 
     def seal(self, config: str) -> str:
         """Return the digest by which a blind report shows a configuration, without telling it.

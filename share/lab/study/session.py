@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from share.errors import UsageError
+from share.lab.study import trial_events as te
 from share.lab.study import trial_machine as tm
 from share.lab.study.asking import LEAST, MOST, AskedForm, AskedItem, PageWords, choice_form, trial_form
 from share.lab.study.plan import ANSWERS, Participant, StudyPlan, StudyQuestion
@@ -65,7 +66,7 @@ class StudySession:
 
     def _carry_out(self, person: Participant, step: TrialStep) -> None:
         goals = [
-            tm.CalledSpot(number, spot, self.plan.spots[spot - 1])
+            te.CalledSpot(number, spot, self.plan.spots[spot - 1])
             for number, spot in left_goals(step, person, self.plan)
         ]
         folder = trial_folder(self.folder, person.name, step.place)
@@ -107,7 +108,9 @@ class StudySession:
             raise UsageError(f"{what}: give --resume to go on, or --leave to mark it as not carried through")
         self.researcher.forget_typed()
         self._say(f"{what}: Enter goes on with it; type 'leave' to mark it as not carried through")
-        return LEAVE if self._typed().strip().lower() == LEAVE else GO_ON
+        while (typed := self._typed().strip().lower()) not in ("", LEAVE):
+            self._say(f"'{typed:.40}' is neither: Enter alone goes on; 'leave' marks it; q ends")
+        return LEAVE if typed == LEAVE else GO_ON
 
     def _leave(self, person: Participant, step: TrialStep) -> None:
         log = StudyLog(trial_folder(self.folder, person.name, step.place) / EVENTS)
@@ -127,22 +130,26 @@ class StudySession:
             if (line := self.researcher.poll()) is not None:
                 return line
             time.sleep(_POLL_S)
-        raise TrialInterruptedError("ended by the researcher; all that was done is kept")
+        raise TrialInterruptedError(f"{self.researcher.end_reason}; all that was done is kept")
 
     # ------------------------------------------------------------ questions
 
     def _ask_about(self, person: Participant, step: AnswerStep) -> None:
-        answers = self._ask(trial_form(self.questions, self.words, step.place))
-        row = {"participant": person.name, "condition": step.condition, "answers": answers}
-        self._append_answers(row)
+        def keep(answers: Mapping[str, int | None]) -> None:
+            about = {"participant": person.name, "condition": step.condition}
+            self._append_answers({**about, "answers": dict(answers)})
+
+        self._ask(trial_form(self.questions, self.words, step.place), keep)
 
     def _ask_choice(self, person: Participant, conditions: Mapping[int, str]) -> None:
-        chosen = self._ask(choice_form(self.words, list(conditions)))
-        row: dict[str, Any] = {"participant": person.name}
-        for kind in (MOST, LEAST):
-            place = chosen[kind]
-            row[kind] = None if place is None else conditions[place]
-        self._append_answers(row)
+        def keep(chosen: Mapping[str, int | None]) -> None:
+            row: dict[str, Any] = {"participant": person.name}
+            for kind in (MOST, LEAST):
+                place = chosen[kind]
+                row[kind] = None if place is None else conditions[place]
+            self._append_answers(row)
+
+        self._ask(choice_form(self.words, list(conditions)), keep)
 
     def _append_answers(self, row: Mapping[str, Any]) -> None:
         log = StudyLog(self.folder / ANSWERS)
@@ -151,23 +158,33 @@ class StudySession:
         finally:
             log.close()
 
-    def _ask(self, form: AskedForm) -> dict[str, int | None]:
+    def _ask(self, form: AskedForm, keep: Callable[[Mapping[str, int | None]], None]) -> None:
+        """Ask until the answers are kept."""
         if self.page is None:
-            return self._ask_here(form)
-        self.page.ask(form)
+            keep(self._ask_here(form))
+            return
+        self.page.ask(form, keep)
         self._say(f"{form.heading}: the questions are on the page; type 'here' to ask them at this terminal")
+        trouble = ""
         try:
-            while (answers := self.page.answers()) is None:
+            while self.page.answers() is None:
                 if self.researcher.wants_end:
-                    raise TrialInterruptedError("ended by the researcher; the questions are asked again")
-                if (self.researcher.poll() or "").strip().lower() == "here":
-                    return self._ask_here(form)
+                    reason = self.researcher.end_reason
+                    raise TrialInterruptedError(f"{reason}; the questions are asked again")
+                typed = (self.researcher.poll() or "").strip()
+                if typed.lower() == "here":
+                    if self.page.withdraw() is None:
+                        keep(self._ask_here(form))
+                        return
+                elif typed:
+                    self._say(f"'{typed:.40}' does nothing; 'here' asks at this terminal, q ends")
+                if self.page.trouble not in ("", trouble):
+                    self._say(f"answers could not be stored, and are still on the page: {self.page.trouble}")
+                trouble = self.page.trouble
                 time.sleep(_POLL_S)
         finally:
-            if self.page.answers() is None:
-                self.page.ask(None)
+            self.page.withdraw()
         self._say("answered")
-        return answers
 
     def _ask_here(self, form: AskedForm) -> dict[str, int | None]:
         self._say(form.heading)

@@ -4,121 +4,50 @@
 Places are in the floor's frame (`share.lab.study.floor`), m; times are seconds of the trial's clock.
 
 A call is the moment when the robot is sent: Enter at the researcher's terminal, or CUBE_RESTS_S after the
-participant has let go of the cube. A cube or a press while the robot is under way calls nothing.
+participant has let go of the cube. A cube or a press while the robot is under way calls nothing. Without a
+robot nothing is called; one that is gone under way breaks the trial off, so that its goal is no miss.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from enum import Enum, auto
 from typing import Any
 
 from share.errors import printable
 from share.lab.study.plan import SuccessRule
 from share.lab.study.standstill import MotionWatch, RobotSample
+from share.lab.study.trial_events import (
+    CalledSpot,
+    CallPressed,
+    CubeSeen,
+    CubeTaken,
+    FloorMoved,
+    GoalTold,
+    Place,
+    RobotGone,
+    RobotPlaced,
+    SayLine,
+    SendRobot,
+    ShowSpot,
+    StopRobot,
+    TimePassed,
+    TrialBroken,
+    TrialEffect,
+    TrialEvent,
+    WriteLine,
+)
 from share.robot.settings import CREATE3_SPEED_M_S
 
 CUBE_RESTS_S = 0.5
+PRESS_AFTER_S = 1.0  # a spot was shown: an earlier press was meant for something else
+GONE_UNDER_WAY_S = 3.0  # after its bridge has fallen silent
 SEND_AGAIN_S = 1.0  # after a refusal, or where the robot's map moved
 _STOPS_WITHIN_S = 5.0  # after a goal's end, or its time-out: then the next spot is shown anyway
 _SEEN_AFTER_S = 0.3  # the end of a goal, the robot is seen to stand
 _MAX_STATUS_LENGTH = 100
 _MAP_GOES_ON = ("the map", "a correction moved", "the robot now in")  # reasons to send the robot again
-
-Place = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class CalledSpot:
-    """A goal of the trial. number: from 1. spot: its number in the plan; place: where that is."""
-
-    number: int
-    spot: int
-    place: Place
-
-
-# ---------------------------------------------------------------- events
-
-
-@dataclass(frozen=True)
-class RobotPlaced:
-    """Where the robot is; None: not known on the floor."""
-
-    sample: RobotSample | None
-
-
-@dataclass(frozen=True)
-class CubeSeen:
-    """A participant's cube came or moved. place: None: in a map that the floor is not in."""
-
-    place: Place | None
-
-
-@dataclass(frozen=True)
-class CallPressed:
-    """The researcher calls for the participant, whose cube lies at the planned spot."""
-
-
-@dataclass(frozen=True)
-class GoalTold:
-    """What becomes of the robot's goal, as its bridge says."""
-
-    text: str
-    is_final: bool
-    is_reached: bool
-
-
-@dataclass(frozen=True)
-class TrialBroken:
-    """The trial cannot go on now. reason: for a person."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class TimePassed:
-    pass
-
-
-TrialEvent = RobotPlaced | CubeSeen | CallPressed | GoalTold | TrialBroken | TimePassed
-
-# ---------------------------------------------------------------- effects
-
-
-@dataclass(frozen=True)
-class WriteLine:
-    """Append a line to events.jsonl."""
-
-    fields: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class ShowSpot:
-    """Show the spot that is next, in the room."""
-
-    called: CalledSpot
-
-
-@dataclass(frozen=True)
-class SendRobot:
-    place: Place
-
-
-@dataclass(frozen=True)
-class StopRobot:
-    pass
-
-
-@dataclass(frozen=True)
-class SayLine:
-    """A line for the researcher."""
-
-    text: str
-
-
-TrialEffect = WriteLine | ShowSpot | SendRobot | StopRobot | SayLine
 
 
 class TrialStage(Enum):
@@ -138,9 +67,11 @@ class TrialMachine:
         self._goals, self._total, self._rule = list(goals), total, rule
         self.stage = TrialStage.CALL
         self._robot: RobotSample | None = None
-        self._cube: tuple[float, Place | None] | None = None  # when it moved last
+        self._gone_since_s: float | None = None  # of the robot
+        self._cube: tuple[float, CubeSeen] | None = None  # when it moved last
+        self.broken_reason = ""
         self._effects: list[TrialEffect] = []
-        self._now_s = 0.0
+        self._now_s = self._shown_s = 0.0
         self._forget_goal()
 
     def _forget_goal(self) -> None:
@@ -151,7 +82,10 @@ class TrialMachine:
         self._status = ""
         self._has_told_motion = False
         self._told_stand_s: float | None = None
-        self._is_standing = self._is_late = self._has_said_again = False
+        self._is_standing = self._is_late = self._has_said_again = self._has_said_gone = False
+        self._called_cube: int | None = None
+        self._cube_written: CubeSeen | CubeTaken | None = None  # since the call: it moved
+        self._cube_now: CubeSeen | CubeTaken | None = None
 
     @property
     def goal(self) -> CalledSpot | None:
@@ -162,8 +96,8 @@ class TrialMachine:
     def is_over(self) -> bool:
         return self.stage in (TrialStage.DONE, TrialStage.BROKEN)
 
-    def begin(self) -> list[TrialEffect]:
-        self._effects = []
+    def begin(self, now_s: float) -> list[TrialEffect]:
+        self._effects, self._now_s = [], now_s
         self._show_next()
         return self._effects
 
@@ -174,9 +108,17 @@ class TrialMachine:
         self._effects, self._now_s = [], now_s
         match event:
             case RobotPlaced():
+                self._gone_since_s = None
                 self._on_robot(event.sample)
+            case RobotGone():
+                self._gone_since_s = now_s
+                self._robot = None
             case CubeSeen():
-                self._on_cube(event.place)
+                self._on_cube(event)
+            case CubeTaken():
+                self._on_cube_taken(event)
+            case FloorMoved():
+                self._on_floor_moved(event.moved_m)
             case CallPressed():
                 self._on_press()
             case GoalTold():
@@ -204,17 +146,54 @@ class TrialMachine:
             self._told_stand_s = since_s
         self._is_standing = since_s is not None
 
-    def _on_cube(self, place: Place | None) -> None:
+    def _on_cube(self, seen: CubeSeen) -> None:
         if self.stage is TrialStage.CALL:
-            self._cube = self._now_s, place
+            self._cube = self._now_s, seen
+        elif seen.number == self._called_cube:
+            self._on_called_cube(seen)
         else:
             self._say("the robot is under way: this cube calls nothing")
 
-    def _on_press(self) -> None:
-        if self.stage is TrialStage.CALL:
-            self._call(None, "terminal")
+    def _on_cube_taken(self, taken: CubeTaken) -> None:
+        if self.stage is not TrialStage.CALL:
+            if taken.number == self._called_cube:
+                self._on_called_cube(taken)
+        elif self._cube is not None and self._cube[1].number == taken.number:
+            self._cube = None
+            self._say("the cube was removed before it called")
+
+    def _on_called_cube(self, event: CubeSeen | CubeTaken) -> None:
+        """Note that the cube that called has moved: the robot goes on to where it lay."""
+        self._cube_now = event
+        if self._cube_written is None:
+            self._write_cube()
+            what = "removed" if isinstance(event, CubeTaken) else "moved"
+            self._say(f"the cube was {what} after it called; the robot drives to where it lay then")
+
+    def _write_cube(self) -> None:
+        self._cube_written = now = self._cube_now
+        place = now.place if isinstance(now, CubeSeen) else None
+        self._write("cube moved", self._now_s, cube_m=None if place is None else _rounded(place))
+
+    def _on_floor_moved(self, moved_m: float | None) -> None:
+        self._write("floor moved", self._now_s, moved_m=None if moved_m is None else round(moved_m, 4))
+        if moved_m is None:
+            self._say("the floor's marker was removed; place it again")
         else:
+            self._say(
+                f"the floor's marker has moved by {moved_m:.2f} m, and all places with it: if somebody moved "
+                "it, put it back, or end by q"
+            )
+
+    def _on_press(self) -> None:
+        if self.stage is not TrialStage.CALL:
             self._say("the robot is under way: Enter calls nothing")
+        elif self._now_s - self._shown_s < PRESS_AFTER_S:
+            self._say("the spot was shown just now: this Enter calls nothing; press it again")
+        elif self._gone_since_s is not None:
+            self._say("no robot: its bridge is silent; look there. Nothing is called")
+        else:
+            self._call(None, "terminal")
 
     def _on_told(self, told: GoalTold) -> None:
         if self.stage is not TrialStage.ROBOT or not told.is_final:
@@ -233,7 +212,8 @@ class TrialMachine:
             self._say(text)
 
     def _on_broken(self, reason: str) -> None:
-        if self.stage is TrialStage.ROBOT:
+        self.broken_reason = reason
+        if self.stage in (TrialStage.ROBOT, TrialStage.STANDSTILL):
             self._effects.append(StopRobot())
         self._effects.append(
             WriteLine({"event": "interrupted", "t_s": round(self._now_s, 3), "reason": printable(reason)})
@@ -242,11 +222,14 @@ class TrialMachine:
 
     def _do_due(self) -> None:
         """Do what the time brings."""
-        now_s = self._now_s
+        now_s, gone_s = self._now_s, self._gone_since_s
+        is_under_way = self.stage in (TrialStage.ROBOT, TrialStage.STANDSTILL)
         if self.stage is TrialStage.CALL and self._cube is not None:
-            moved_s, place = self._cube
+            moved_s, seen = self._cube
             if now_s - moved_s >= CUBE_RESTS_S:
-                self._call(place, "headset")
+                self._call_by_cube(seen)
+        elif is_under_way and gone_s is not None and now_s - gone_s >= GONE_UNDER_WAY_S:
+            self._on_broken("the robot is gone: its bridge is silent; look at the robot, it may still drive")
         elif self.stage is TrialStage.ROBOT:
             if now_s > self._limit_s and not self._is_late:
                 self._on_time_out()
@@ -270,7 +253,7 @@ class TrialMachine:
     def _on_time_out(self) -> None:
         self._is_late, self._ended_s = True, self._now_s
         self._effects.append(StopRobot())
-        self._say("its time is over; the robot is stopped")
+        self._say("its time is over; the robot is told to stop")
         if self._send_again_s is not None:  # it has no goal now
             self._end_goal(self._status)
 
@@ -278,7 +261,7 @@ class TrialMachine:
 
     def _show_next(self) -> None:
         self._forget_goal()
-        self._cube = None
+        self._cube, self._shown_s = None, self._now_s
         self.stage = TrialStage.CALL
         goal = self.goal
         if goal is None:
@@ -288,6 +271,14 @@ class TrialMachine:
         self._effects.append(ShowSpot(goal))
         where = f"x {goal.place[0]:.2f} y {goal.place[1]:.2f} m"
         self._say(f"{goal.number} of {self._total}: spot {goal.spot}, {where}; the cube, or Enter, calls")
+
+    def _call_by_cube(self, seen: CubeSeen) -> None:
+        if self._gone_since_s is None:
+            self._called_cube = seen.number
+            self._call(seen.place, "headset")
+        elif not self._has_said_gone:
+            self._has_said_gone = True
+            self._say("no robot: its bridge is silent; look there. The cube calls once it is back")
 
     def _call(self, cube: Place | None, by: str) -> None:
         goal = self._goals[0]
@@ -323,6 +314,8 @@ class TrialMachine:
         since_s, newest = self._watch.stands_since(), self._watch.newest
         if stands and since_s is not None and self._told_stand_s is None:  # it never began to move
             self._write_stand(max(since_s, self._called_s))
+        if self._cube_now is not self._cube_written:
+            self._write_cube()  # where it lies now
         took_s = (self._told_stand_s or self._now_s) - self._called_s
         self._write("status", self._now_s, status=self._status)
         where = ""

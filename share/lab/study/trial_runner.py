@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from share.errors import ShareError
+from share.lab.study import trial_events as te
 from share.lab.study import trial_machine as tm
 from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor, find_markers, floor_of
 from share.lab.study.readiness import Readiness, RoomState, check_room
@@ -23,6 +24,7 @@ _CHECK_S = 1.0
 _GONE_S = 2.0  # without a word of the robot's bridge its place is not known
 _END_S = 3.0  # for what is asked for at the end of a trial
 _MOVED_M = 0.03  # of a cube on the floor; less is none
+_TURNED_RAD = 0.03  # of the floor's marker; less is none
 _REMOVED = -1  # id of a marker that is gone
 
 
@@ -44,7 +46,12 @@ class Researcher(Protocol):
 
     @property
     def wants_end(self) -> bool:
-        """Whether Ctrl-C was pressed, or q typed."""
+        """Whether Ctrl-C was pressed, or q typed, or nothing can be typed any more."""
+        ...
+
+    @property
+    def end_reason(self) -> str:
+        """Why it is to end."""
         ...
 
 
@@ -67,12 +74,12 @@ class TrialRunner:
         self._robot_name: str | None = None  # of the trial's, once it has begun
         self._command: int | None = None
         self._marker_id: int | None = None
-        self._cubes: dict[int, tm.Place | None] = {}  # on the floor
+        self._cubes: dict[int, te.Place | None] = {}  # on the floor
         self._called_cubes: set[int] = set()
-        self._broken_reason = ""
+        self._floor_before: StudyFloor | None = None  # where the marker was last
         self._began_s = time.monotonic()
         self._offset_s = 0.0
-        self._shown: tm.CalledSpot | None = None
+        self._shown: te.CalledSpot | None = None
 
     # ------------------------------------------------------------ before
 
@@ -98,7 +105,7 @@ class TrialRunner:
                 if is_well and not was_well:
                     self._researcher.say("all is well: Enter begins the trial")
                 was_well = is_well
-            if self._researcher.poll() is None or not checks:
+            if not self._is_enter("begins") or not checks:
                 continue
             bad = [one.name for one in checks if not one.is_well]
             if len(find_markers(self._room.objects)) != 1:
@@ -109,6 +116,14 @@ class TrialRunner:
                 has_warned = True
                 self._researcher.forget_typed()
                 self._researcher.say(f"not well: {', '.join(bad)}; Enter again begins all the same")
+
+    def _is_enter(self, does: str) -> bool:
+        """Return whether Enter alone was pressed since; another line is answered. does: what Enter does."""
+        typed = self._researcher.poll()
+        if typed is None or not (text := typed.strip()):
+            return typed is not None
+        self._researcher.say(f"Enter alone {does}, q and Enter ends; '{text:.40}' does nothing")
+        return False
 
     def _state(self) -> RoomState:
         report, trouble = self._room.report()
@@ -121,6 +136,7 @@ class TrialRunner:
         """Carry it through."""
         self._marker_id = find_markers(self._room.objects)[0].object_id
         self._began_s, self._offset_s = time.monotonic(), header.last_s
+        self._floor_before = self._floor
         self._place_cubes()
         self._researcher.forget_typed()
         report, _ = self._room.report()
@@ -137,8 +153,10 @@ class TrialRunner:
         }
         try:
             self._log.append(begin)
-            self._carry_out(self._machine.begin())
-            if self._robot is not None:
+            self._carry_out(self._machine.begin(self._now_s()))
+            if self._robot is None:
+                self._handle(te.RobotGone())
+            else:
                 self._take_robot(self._robot[1])
             while not self._machine.is_over:
                 self._step()
@@ -148,39 +166,38 @@ class TrialRunner:
         finally:
             self._leave()
         if self._machine.stage is tm.TrialStage.BROKEN:
-            raise TrialInterruptedError(self._broken_reason)
+            raise TrialInterruptedError(self._machine.broken_reason)
 
     def _now_s(self) -> float:
         return self._offset_s + time.monotonic() - self._began_s
 
     def _step(self) -> None:
         self._take_news(_STEP_MS)
-        reason = "ended by the researcher" if self._researcher.wants_end else self._room.broken()
+        reason = self._researcher.end_reason if self._researcher.wants_end else self._room.broken()
         if reason is not None:
-            self._broken_reason = reason
-            self._handle(tm.TrialBroken(reason))
+            self._handle(te.TrialBroken(reason))
             return
-        if self._researcher.poll() is not None:
-            self._handle(tm.CallPressed())
-        self._handle(tm.TimePassed())
+        if self._is_enter("calls the robot"):
+            self._handle(te.CallPressed())
+        self._handle(te.TimePassed())
 
-    def _handle(self, event: tm.TrialEvent) -> None:
+    def _handle(self, event: te.TrialEvent) -> None:
         self._carry_out(self._machine.handle(event, self._now_s()))
 
-    def _carry_out(self, effects: list[tm.TrialEffect]) -> None:
+    def _carry_out(self, effects: list[te.TrialEffect]) -> None:
         for effect in effects:
             match effect:
-                case tm.WriteLine():
+                case te.WriteLine():
                     self._log.append(effect.fields)
-                case tm.SayLine():
+                case te.SayLine():
                     self._researcher.say(effect.text)
-                case tm.ShowSpot():
+                case te.ShowSpot():
                     self._shown = effect.called
                     self._remove_cubes()
                     self._show_spot()
-                case tm.SendRobot():
+                case te.SendRobot():
                     self._send(effect.place)
-                case tm.StopRobot():
+                case te.StopRobot():
                     self._room.stop_robot()
 
     @property
@@ -198,10 +215,10 @@ class TrialRunner:
             self._room.remove(number)
         self._called_cubes.clear()
 
-    def _send(self, place: tm.Place) -> None:
+    def _send(self, place: te.Place) -> None:
         floor = self._floor
         if floor is None:
-            told = tm.GoalTold("refused: the floor's marker is gone; place it again", True, False)
+            told = te.GoalTold("refused: the floor's marker is gone; place it again", True, False)
             self._handle(told)
             return
         self._command = self._room.send_robot(floor, place, self._robot_name)
@@ -215,28 +232,29 @@ class TrialRunner:
                     self._robot = time.monotonic(), one.place
                     self._take_robot(one.place)
                 case CommandChanged() if one.state.command == self._command and self._command is not None:
-                    self._handle(tm.GoalTold(one.state.text, one.state.is_final, one.state.is_reached))
+                    self._handle(te.GoalTold(one.state.text, one.state.is_final, one.state.is_reached))
                 case ObjectChanged():
                     self._take_object(one)
         if self._robot is not None and time.monotonic() - self._robot[0] > _GONE_S:
             self._robot = None
-            self._handle(tm.RobotPlaced(None))
+            self._handle(te.RobotGone())
 
     def _take_robot(self, place: RobotPlace) -> None:
         floor = self._floor
         if self._marker_id is not None:  # the trial has begun, with this robot
             self._robot_name = place.robot
-        self._handle(tm.RobotPlaced(None if floor is None else floor.robot(place, self._now_s())))
+        self._handle(te.RobotPlaced(None if floor is None else floor.robot(place, self._now_s())))
 
     def _take_object(self, change: ObjectChanged) -> None:
         one = change.changed
         if self._marker_id is None or one.owner == STUDY_NAME:  # before the trial
             return
         if one.object_id == self._marker_id and one.removed:
-            self._researcher.say("the floor's marker was removed; place it again")
             self._marker_id = _REMOVED
+            self._handle(te.FloorMoved(None))
         elif self._marker_id in (one.object_id, _REMOVED) and one.kind is ObjectKind.MARKER:
             self._marker_id = one.object_id
+            self._note_floor()
             self._place_cubes()
             self._show_spot()
         elif one.kind is ObjectKind.CUBE:
@@ -245,6 +263,7 @@ class TrialRunner:
     def _take_cube(self, cube: RoomObject) -> None:
         if cube.removed:
             self._cubes.pop(cube.object_id, None)
+            self._handle(te.CubeTaken(cube.object_id))
             return
         floor = self._floor
         place, is_new = None if floor is None else floor.cube(cube), cube.object_id not in self._cubes
@@ -253,7 +272,18 @@ class TrialRunner:
         # one that goes with its map does not move on the floor, before or after the floor's marker does
         if is_new or (place is not None and (before is None or math.dist(place, before) > _MOVED_M)):
             self._called_cubes.add(cube.object_id)
-            self._handle(tm.CubeSeen(place))
+            self._handle(te.CubeSeen(place, cube.object_id))
+
+    def _note_floor(self) -> None:
+        """Tell the trial where the marker moved within its map: in another one it has gone with its map."""
+        before, now = self._floor_before, self._floor
+        self._floor_before = now or before
+        if before is None or now is None or before.map_id != now.map_id:
+            return
+        T = before.T_map_floor.inverse() @ now.T_map_floor
+        moved_m = math.hypot(T.x, T.y)
+        if moved_m > _MOVED_M or abs(T.yaw) > _TURNED_RAD:
+            self._handle(te.FloorMoved(moved_m))
 
     def _place_cubes(self) -> None:
         """Note where cubes lie on the floor, that or whose map has moved."""
@@ -264,7 +294,7 @@ class TrialRunner:
 
     def _end_if_broken(self) -> None:
         if self._researcher.wants_end:
-            raise TrialInterruptedError("ended by the researcher, before it began")
+            raise TrialInterruptedError(f"{self._researcher.end_reason}, before it began")
         if (reason := self._room.broken()) is not None:
             raise TrialInterruptedError(reason)
 

@@ -71,13 +71,19 @@ class CalledGoal:
 @dataclass
 class TrialRecord:
     """What happened in a trial. is_complete: it was carried through. repeated: calls at each spot that a
-    later call of the same goal replaced."""
+    later call of the same goal replaced. unwell: what was not well when it began; seals: digests of its
+    edges' configurations. moved_cubes: goals whose cube moved after it called; moved_floors: how often the
+    marker did."""
 
     condition: str
     judge: str
     goals: dict[int, CalledGoal]  # by number, from 1
     is_complete: bool
     repeated: Counter[int] = field(default_factory=Counter)
+    unwell: set[str] = field(default_factory=set)
+    seals: set[str] = field(default_factory=set)
+    moved_cubes: set[int] = field(default_factory=set)
+    moved_floors: int = 0
 
 
 def trial_folder(study: Path, participant: str, place: int) -> Path:
@@ -120,6 +126,9 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
                         f"{where}: judge {event['judge']}, before {record.judge}; a trial has one"
                     )
                 record.judge = event["judge"]
+                record.unwell |= {str(one) for one in event.get("unwell") or ()}
+                if event.get("config_sha256") is not None:
+                    record.seals.add(str(event["config_sha256"]))
             elif not record.judge:
                 raise DataError(f"{where}: {kind} before begin")
             elif kind in _READERS:
@@ -156,6 +165,7 @@ def _read_call(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -
         raise ValueError(f"goal {number} at spot {goal.spot}; the plan has {len(plan.spots)} of each")
     if number in record.goals:
         record.repeated[record.goals[number].spot] += 1
+        record.moved_cubes.discard(number)
     record.goals[number] = goal
 
 
@@ -178,6 +188,22 @@ def _read_status(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan)
     record.goals[_whole(event["goal"])].status = status
 
 
+def _read_moved_cube(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    number = _whole(event["goal"])
+    if event["cube_m"] is not None:
+        _position(event["cube_m"])
+    if number not in record.goals:
+        raise ValueError(f"goal {number} was not called")
+    record.moved_cubes.add(number)
+
+
+def _read_moved_floor(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
+    _whole(event["goal"])
+    if event["moved_m"] is not None:
+        _number(event["moved_m"])
+        record.moved_floors += 1
+
+
 def _read_end(record: TrialRecord, event: Mapping[str, Any], plan: StudyPlan) -> None:
     record.is_complete = True
 
@@ -191,6 +217,8 @@ _READERS: dict[str, Callable[[TrialRecord, Mapping[str, Any], StudyPlan], None]]
     "moves": _read_moves,
     "stands": _read_stands,
     "status": _read_status,
+    "cube moved": _read_moved_cube,
+    "floor moved": _read_moved_floor,
     "interrupted": _read_interruption,
     "end": _read_end,
 }

@@ -7,7 +7,7 @@ import socket
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from helpers.study_folder import small_plan
 
-from share.errors import ConfigError, UsageError
+from share.errors import ConfigError, ShareError, UsageError
 from share.lab.study.asking import PageWords, choice_form, read_wording, trial_form
 from share.lab.study.plan import QUESTIONS
 from share.lab.study.question_page import QuestionPage
@@ -91,6 +91,10 @@ def test_a_wording_without_words_has_the_usual_ones(tmp_path: Path) -> None:
     assert [one.text for one in questions] == ["T", "T"] and words == PageWords()
 
 
+def nothing(answers: Mapping[str, int | None]) -> None:
+    pass
+
+
 class PageBench:
     def __init__(self, page: QuestionPage) -> None:
         self.page = page
@@ -123,7 +127,7 @@ def bench() -> Iterator[PageBench]:
 
 def test_a_form_is_shown_until_it_is_answered_once(bench: PageBench) -> None:
     assert bench.fetch("/")[0] == 200 and bench.shown()["form"] is None
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     assert bench.shown()["form"]["heading"] == "After round 2" and bench.page.answers() is None
     number = bench.shown()["number"]
     assert bench.send({"predictability": 7, "responsiveness": 10})[0] == 200
@@ -134,9 +138,9 @@ def test_a_form_is_shown_until_it_is_answered_once(bench: PageBench) -> None:
 
 
 def test_answers_to_an_earlier_form_are_refused(bench: PageBench) -> None:
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     number = bench.shown()["number"]
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     assert bench.send({"predictability": 7}, number)[0] == 409 and bench.page.answers() is None
 
 
@@ -144,19 +148,19 @@ def test_answers_to_an_earlier_form_are_refused(bench: PageBench) -> None:
     "body", [b"", b"x", b"[]", b"{}", b'{"number": 1}', b'{"number": "x", "answers": {}}', b"\xff" * 100]
 )
 def test_what_is_no_answer_is_refused(bench: PageBench, body: bytes) -> None:
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     assert bench.fetch("/answers", body)[0] == 400 and bench.page.answers() is None
 
 
 def test_answers_out_of_range_are_refused_with_a_line(bench: PageBench) -> None:
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     status, text = bench.send({"predictability": 11})
     assert (status, text) == (400, "predictability: 11 is not a whole number from 1 to 10\n")
     assert bench.send({"predictability": 10})[0] == 200
 
 
 def test_other_pages_send_no_answers(bench: PageBench) -> None:
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     assert bench.send({}, Origin="http://evil.example")[0] == 403
     assert bench.send({}, Origin="")[0] == 403
     assert bench.fetch("/answers", b"x" * 9000)[0] == 431
@@ -169,7 +173,7 @@ def test_others_need_the_token() -> None:
         QuestionPage("0.0.0.0:0", PageWords())
     with closing(QuestionPage("127.0.0.1:0", PageWords(), "t" * 20)) as page:
         bench = PageBench(page)
-        page.ask(FORM)
+        page.ask(FORM, nothing)
         assert bench.fetch("/")[0] == 401 and bench.fetch("/form.json")[0] == 401
         assert bench.fetch("/answers", {"number": 1, "answers": {}})[0] == 401
         assert bench.fetch("/form.json", Authorization=f"Bearer {'t' * 20}")[0] == 200
@@ -186,16 +190,55 @@ def sent_raw(page: QuestionPage, *pieces: bytes) -> bytes:
 
 
 def test_a_body_may_come_in_pieces_and_ends_where_it_says(bench: PageBench) -> None:
-    bench.page.ask(FORM)
-    body = json.dumps({"number": 1, "answers": {"predictability": 4}}).encode()
+    bench.page.ask(FORM, nothing)
+    body = json.dumps({"number": bench.shown()["number"], "answers": {"predictability": 4}}).encode()
     head = (
         f"POST /answers HTTP/1.1\r\nOrigin: http://{bench.page.endpoint}\r\nHost: {bench.page.endpoint}\r\n"
     )
     first = f"{head}Content-Length: {len(body)}\r\n".encode()
     assert sent_raw(bench.page, first, b"\r\n", body[:10], body[10:]) == b"HTTP/1.1 200"
     assert bench.page.answers() == {"predictability": 4, "responsiveness": None}
-    bench.page.ask(FORM)
+    bench.page.ask(FORM, nothing)
     for length in ("99999999999", "-1", "x", ""):
         answer = sent_raw(bench.page, f"{head}Content-Length: {length}\r\n\r\n".encode(), b"y" * 9000)
         assert answer in (b"HTTP/1.1 431", b"HTTP/1.1 400", b"")
     assert bench.page.answers() is None and bench.fetch("/")[0] == 200
+
+
+def test_answers_are_acknowledged_once_they_are_kept(bench: PageBench) -> None:
+    kept: list[dict[str, int | None]] = []
+
+    def keep(answers: Mapping[str, int | None]) -> None:
+        if not is_full:
+            kept.append(dict(answers))
+            return
+        raise ShareError("answers.jsonl: cannot be written: No space left on device")
+
+    is_full = True
+    bench.page.ask(FORM, keep)
+    status, text = bench.send({"predictability": 7})
+    assert status == 503 and "tell the researcher" in text and bench.page.answers() is None
+    assert bench.shown()["form"] is not None and "No space left" in bench.page.trouble
+    is_full = False
+    assert bench.send({"predictability": 7})[0] == 200
+    assert kept == [{"predictability": 7, "responsiveness": None}] == [bench.page.answers()]
+    assert bench.page.trouble == ""
+
+
+def test_a_form_that_was_withdrawn_takes_no_answer(bench: PageBench) -> None:
+    bench.page.ask(FORM, nothing)
+    number = bench.shown()["number"]
+    assert bench.page.withdraw() is None and bench.shown()["form"] is None
+    assert bench.send({"predictability": 7}, number) == (409, "this is not asked here any more\n")
+    bench.page.ask(FORM, nothing)
+    bench.send({"predictability": 7})
+    assert bench.page.withdraw() == {"predictability": 7, "responsiveness": None}
+
+
+def test_a_tab_of_an_earlier_run_answers_nothing() -> None:
+    numbers = []
+    for _ in range(2):
+        with closing(QuestionPage("127.0.0.1:0", PageWords())) as page:
+            page.ask(FORM, nothing)
+            numbers.append(PageBench(page).shown()["number"])
+    assert abs(numbers[0] - numbers[1]) > 100

@@ -38,7 +38,7 @@ def test_a_participant_answers() -> None:
             return text in str(page.evaluate("document.body.innerText"))
 
         soon(lambda: shows("The questions come here after each round."))
-        served.ask(trial_form(QUESTIONS, PageWords(), 3))
+        served.ask(trial_form(QUESTIONS, PageWords(), 3), lambda answers: None)
         soon(lambda: shows("After round 3") and shows("1: not at all") and shows("10: always"))
         page.click(_OPTION.format(1, 7))
         page.click("#send")
@@ -49,7 +49,7 @@ def test_a_participant_answers() -> None:
         page.click("#send")
         soon(lambda: served.answers() == {"predictability": 7, "responsiveness": 10})
         soon(lambda: shows("Thank you."))
-        served.ask(choice_form(PageWords(), [1, 2, 3, 4]))
+        served.ask(choice_form(PageWords(), [1, 2, 3, 4]), lambda answers: None)
         soon(lambda: shows("After the last round"))
         assert page.evaluate("document.querySelectorAll('input:checked').length") == 0
         width = page.evaluate("document.documentElement.scrollWidth")

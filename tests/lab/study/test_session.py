@@ -93,6 +93,7 @@ def test_a_trial_of_another_plan_is_refused(tmp_path: Path) -> None:
 class TypingResearcher:
     typed: list[str]
     lines: list[str] = field(default_factory=list)
+    end_reason: str = "ended by the researcher"
 
     def say(self, text: str) -> None:
         self.lines.append(text)
@@ -168,7 +169,7 @@ def test_the_edge_with_keys_gives_no_rights_to_all(given: tuple[str, ...], folde
 def test_an_interrupted_trial_is_asked_about_and_left(tmp_path: Path) -> None:
     write_trial(tmp_path, 1, 1)
     _, steps = read_progress(tmp_path, PLAN).choose("p01")
-    made, researcher = session(tmp_path, " Leave ", "2", "3", "end")
+    made, researcher = session(tmp_path, "leaf", " Leave ", "2", "3", "end")
     made.lead(P01, [*steps[:2], steps[-1]])  # of the trials, the first alone
     assert "p01, trial 1 was interrupted after 1 of its spots: Enter goes on" in researcher.lines[0]
     assert answers(tmp_path) == [{"participant": "p01", "most": LETTERS[1], "least": LETTERS[2]}]

@@ -177,7 +177,7 @@ FILES = (Path(__file__).resolve().parents[3] / "docs" / "lookup" / "files.md").r
 def first_column(title: str) -> list[str]:
     """Return the names in the first cells of the table below a heading."""
     part = FILES.partition(f"### `{title}`\n")[2].partition("\n###")[0]
-    return re.findall(r"^\| `(\w+)` \|", part, re.MULTILINE)
+    return re.findall(r"^\| `([\w ]+)` \|", part, re.MULTILINE)
 
 
 def test_the_page_on_files_has_every_key_and_event() -> None:

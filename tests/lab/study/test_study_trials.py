@@ -383,3 +383,31 @@ def test_wrong_preferences_are_refused(tmp_path: Path, text: str, says: str) -> 
     (tmp_path / "b.csv").write_text(text)
     with pytest.raises(DataError, match=says):
         read_table(tmp_path / "a.csv", {}, tmp_path / "b.csv")
+
+
+def test_what_was_not_as_it_should_be_is_told(tmp_path: Path) -> None:
+    end, trial = {"event": "end", "t_s": 2000.0}, PLAN.participants[0].trials[0]
+    other = next(one for one in PLAN.participants[1:] if one.trials[0].condition != trial.condition)
+    moved = {"event": "cube moved", "t_s": 101.0, "goal": 1, "cube_m": [1.5, 1.0]}
+    floor = {"event": "floor moved", "t_s": 102.0, "goal": 1, "moved_m": 0.4}
+    taken = {"event": "cube moved", "t_s": 201.0, "goal": 2, "cube_m": None}
+
+    def notes(*more: dict[str, Any], **begins: Any) -> str:
+        goals = goal_events(1, 1, 5.0, 100.0), goal_events(2, 2, 5.0, 200.0)
+        write_trial(tmp_path, begin(PLAN, P01, 1, **begins), *goals[0], *goals[1], *more, end)
+        path = trial_folder(tmp_path, other.name, 1) / "events.jsonl"
+        write_lines(path, [begin(PLAN, other.name, 1, config_sha256="cd"), *goals[0], *goals[1], end])
+        return "\n".join(read_study(tmp_path, PLAN, RULE).notes)
+
+    well = notes(config_sha256="ab", unwell=[])  # another condition has another configuration
+    assert not any(words in well for words in ("moved", "not all was well", "CHANGES"))
+    told = notes(moved, moved, taken, floor, unwell=["clocks", "robot"])
+    assert "2 of 4 cubes were moved or removed after they had called" in told
+    assert "the floor's marker moved during 1 of 2 trials" in told
+    assert "1 of 2 trials were begun though not all was well: clocks 1, robot 1" in told
+    again = begin(PLAN, P01, 1, config_sha256="ef")  # after an interruption
+    changed = notes(again, config_sha256="ab")
+    assert f"CONFIGURATION CHANGES within condition {trial.condition}: 2 of them in 1 trials" in changed
+    write_trial(tmp_path, begin(PLAN, P01, 1), *goal_events(1, 1, 5.0, 100.0), taken)
+    with pytest.raises(DataError, match="goal 2 was not called"):
+        read_study(tmp_path, PLAN, RULE)

@@ -17,6 +17,7 @@ import pytest
 
 from share.errors import ShareError
 from share.geometry.se3 import from_rt, so3_exp
+from share.lab.study import trial_events as te
 from share.lab.study import trial_machine as tm
 from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor
 from share.lab.study.plan import SuccessRule
@@ -27,7 +28,7 @@ from share.types import F64
 from share.wire.room_messages import CommandState, ObjectKind, RobotPlace, RoomObject
 
 MAP, OTHER, MARKER = "ann-1/0", "bot-1/0", 7
-SPOTS = [tm.CalledSpot(1, 4, (1.0, 1.0)), tm.CalledSpot(2, 2, (3.0, 1.0))]
+SPOTS = [te.CalledSpot(1, 4, (1.0, 1.0)), te.CalledSpot(2, 2, (3.0, 1.0))]
 # where the map is in the other one
 T_OTHER_MAP = from_rt(so3_exp(np.array([0.0, 0.0, 1.1])), np.array([5.0, -2.0, 0.0]))
 
@@ -110,6 +111,7 @@ class MadeUpResearcher:
     lines: list[str] = field(default_factory=list)
     typed: list[str] = field(default_factory=list)
     wants_end: bool = False
+    end_reason: str = "ended by the researcher"
 
     def say(self, text: str) -> None:
         self.lines.append(text)
@@ -229,7 +231,7 @@ def test_an_edge_that_is_gone_ends_the_trial_with_its_reason(bench: RunnerBench)
 def test_the_researcher_ends_the_trial_and_the_robot_stops(bench: RunnerBench) -> None:
     def end(step: int) -> None:
         bench.researcher.wants_end = step >= 30
-        if step == 20:
+        if step == 25:
             bench.researcher.typed.append("")
             bench.room.send_robot = lambda *goal: 5  # type: ignore[method-assign]
 
@@ -243,7 +245,7 @@ def test_a_full_disk_stops_the_robot_and_loses_nothing(
     bench: RunnerBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def press(step: int) -> None:
-        if step == 20:
+        if step == 25:
             bench.researcher.typed.append("")
         if step == 30:
             monkeypatch.setattr(os, "write", full)
@@ -303,3 +305,48 @@ def test_no_trial_begins_without_its_floor(bench: RunnerBench) -> None:
         bench.runner.wait_until_ready()
     assert "no spot can be shown without the floor's one marker; see above" in bench.researcher.lines
     assert not bench.log.path.exists()
+
+
+def test_only_enter_alone_calls(bench: RunnerBench) -> None:
+    def press(step: int) -> None:
+        if step in (40, 200):
+            bench.researcher.typed += ["help", "go on"]
+            assert len(bench.room.sent) == (step == 200)
+        if step in (60, 220):
+            bench.researcher.typed.append(" ")
+
+    bench.room.at_step = press
+    bench.run()
+    calls = bench.events("call")
+    assert len(calls) == 2 and calls[0]["t_s"] == pytest.approx(23.0, abs=0.1)
+    assert (
+        bench.researcher.lines.count("Enter alone calls the robot, q and Enter ends; 'help' does nothing")
+        == 2
+    )
+
+
+def test_a_marker_that_somebody_moves_is_told(bench: RunnerBench) -> None:
+    def move(step: int) -> None:
+        if step in (30, 31):  # the second time by less than the noise
+            bench.room.put(thing(MARKER, ObjectKind.MARKER, "lead", at(0.3 + 0.001 * step, 0.0)))
+        if step in (60, 200):
+            bench.researcher.typed.append("")
+
+    bench.room.at_step = move
+    bench.run()
+    assert [one["moved_m"] for one in bench.events("floor moved")] == [0.33]
+
+
+def test_a_bridge_that_dies_under_way_interrupts_the_trial(bench: RunnerBench) -> None:
+    def die(step: int) -> None:
+        if step == 40:
+            bench.room.send_robot = lambda *goal: 5  # type: ignore[method-assign]
+            bench.researcher.typed.append("")
+        if step > 60:
+            bench.room.steps -= step % 4 == 3  # never its turn
+            bench.researcher.wants_end = bench.clock[0] > 90.0
+
+    bench.room.at_step = die
+    with pytest.raises(TrialInterruptedError, match="the robot is gone: its bridge is silent"):
+        bench.run()
+    assert len(bench.events("call")) == 1 and not bench.events("status")
