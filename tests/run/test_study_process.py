@@ -219,6 +219,7 @@ def post(url: str, body: dict[str, Any]) -> None:
         assert answer.status == 200
 
 
+@pytest.mark.slow
 def test_the_policies_of_two_trials_cannot_be_told_apart_by_name(share: Any, address: str) -> None:
     """The same trial under `share` and `fixed`: what stands around policies' names (share is the program's,
     too) is the same in all files, names of files, pages, metrics and lines of the terminal. An edge that is
@@ -303,6 +304,7 @@ def test_a_study_that_is_killed_in_mid_trial_goes_on(share: Any, address: str) -
     assert "1 calls were repeated" in done.out
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_come_and_no_marker(share: Any, address: str) -> None:
     Path("room.sqlite").unlink()
     study_map(Path("room.sqlite"), has_marker=False)
