@@ -65,7 +65,7 @@ class CallPressed:
 
 
 @dataclass(frozen=True)
-class GoalTold:
+class GoalReported:
     """What becomes of the robot's goal, as its bridge says."""
 
     text: str
@@ -92,7 +92,7 @@ TrialEvent = (
     | CubeTaken
     | FloorMoved
     | CallPressed
-    | GoalTold
+    | GoalReported
     | TrialBroken
     | TimePassed
 )

@@ -24,7 +24,7 @@ from share.lab.study.trial_events import (
     CubeSeen,
     CubeTaken,
     FloorMoved,
-    GoalTold,
+    GoalReported,
     Place,
     RobotGone,
     RobotPlaced,
@@ -80,8 +80,8 @@ class TrialMachine:
         self._target: Place = (0.0, 0.0)
         self._send_again_s: float | None = None
         self._status = ""
-        self._has_told_motion = False
-        self._told_stand_s: float | None = None
+        self._has_written_motion = False
+        self._written_stand_s: float | None = None
         self._is_standing = self._is_late = self._has_said_again = self._has_said_gone = False
         self._called_cube: int | None = None
         self._cube_written: CubeSeen | CubeTaken | None = None  # since the call: it moved
@@ -121,8 +121,8 @@ class TrialMachine:
                 self._on_floor_moved(event.moved_m)
             case CallPressed():
                 self._on_press()
-            case GoalTold():
-                self._on_told(event)
+            case GoalReported():
+                self._on_goal_report(event)
             case TrialBroken():
                 self._on_broken(event.reason)
             case TimePassed():
@@ -137,13 +137,13 @@ class TrialMachine:
         if sample is None or self.stage is TrialStage.CALL:
             return
         self._watch.add(sample)
-        if self._watch.moves_s is not None and not self._has_told_motion:
-            self._has_told_motion = True
+        if self._watch.moves_s is not None and not self._has_written_motion:
+            self._has_written_motion = True
             self._write("moves", self._watch.moves_s)
         since_s = self._watch.stands_since()
-        if self._has_told_motion and since_s is not None and not self._is_standing:
+        if self._has_written_motion and since_s is not None and not self._is_standing:
             self._write_stand(max(since_s, self._called_s))
-            self._told_stand_s = since_s
+            self._written_stand_s = since_s
         self._is_standing = since_s is not None
 
     def _on_cube(self, seen: CubeSeen) -> None:
@@ -195,20 +195,20 @@ class TrialMachine:
         else:
             self._call(None, "terminal")
 
-    def _on_told(self, told: GoalTold) -> None:
-        if self.stage is not TrialStage.ROBOT or not told.is_final:
+    def _on_goal_report(self, report: GoalReported) -> None:
+        if self.stage is not TrialStage.ROBOT or not report.is_final:
             return
-        text = printable(told.text)
+        text = printable(report.text)
         is_to_repeat = text.startswith("refused") or any(words in text for words in _MAP_GOES_ON)
-        if not told.is_reached and is_to_repeat and not self._is_late:
+        if not report.is_reached and is_to_repeat and not self._is_late:
             if not self._has_said_again:
                 self._has_said_again = True
                 self._say(f"{text}; it is called again until its time is over")
             self._send_again_s = self._now_s + SEND_AGAIN_S
             self._status = _word(text)
             return
-        self._end_goal("reached" if told.is_reached else "timed out" if self._is_late else _word(text))
-        if not told.is_reached and not self._is_late:
+        self._end_goal("reached" if report.is_reached else "timed out" if self._is_late else _word(text))
+        if not report.is_reached and not self._is_late:
             self._say(text)
 
     def _on_broken(self, reason: str) -> None:
@@ -312,11 +312,11 @@ class TrialMachine:
 
     def _finish_goal(self, stands: bool) -> None:
         since_s, newest = self._watch.stands_since(), self._watch.newest
-        if stands and since_s is not None and self._told_stand_s is None:  # it never began to move
+        if stands and since_s is not None and self._written_stand_s is None:  # it never began to move
             self._write_stand(max(since_s, self._called_s))
         if self._cube_now is not self._cube_written:
             self._write_cube()  # where it lies now
-        took_s = (self._told_stand_s or self._now_s) - self._called_s
+        took_s = (self._written_stand_s or self._now_s) - self._called_s
         self._write("status", self._now_s, status=self._status)
         where = ""
         if newest is not None:

@@ -218,8 +218,8 @@ class TrialRunner:
     def _send(self, place: te.Place) -> None:
         floor = self._floor
         if floor is None:
-            told = te.GoalTold("refused: the floor's marker is gone; place it again", True, False)
-            self._handle(told)
+            report = te.GoalReported("refused: the floor's marker is gone; place it again", True, False)
+            self._handle(report)
             return
         self._command = self._room.send_robot(floor, place, self._robot_name)
 
@@ -232,7 +232,7 @@ class TrialRunner:
                     self._robot = time.monotonic(), one.place
                     self._take_robot(one.place)
                 case CommandChanged() if one.state.command == self._command and self._command is not None:
-                    self._handle(te.GoalTold(one.state.text, one.state.is_final, one.state.is_reached))
+                    self._handle(te.GoalReported(one.state.text, one.state.is_final, one.state.is_reached))
                 case ObjectChanged():
                     self._take_object(one)
         if self._robot is not None and time.monotonic() - self._robot[0] > _GONE_S:

@@ -47,7 +47,7 @@ class TrialBench:
             self.wait(1 / HZ)
 
     def told(self, text: str, is_final: bool = True, is_reached: bool = False) -> None:
-        self.do(te.GoalTold(text, is_final, is_reached))
+        self.do(te.GoalReported(text, is_final, is_reached))
 
     def of(self, kind: type) -> list[Any]:
         return [one for one in self.effects if isinstance(one, kind)]
