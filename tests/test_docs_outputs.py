@@ -88,7 +88,9 @@ def text_constants(files: Iterable[Path]) -> set[str]:
 def test_events_are_those_that_the_code_writes() -> None:
     """That it writes no other is a matter of types (`make type`)."""
     writers = [*(ROOT / "share/protocol").glob("*.py"), *(ROOT / "share/mapping").rglob("*.py")]
-    written = text_constants([*writers, ROOT / "share/runtime/edge.py"])
+    written = text_constants(
+        [*writers, ROOT / "share/runtime/edge.py", ROOT / "share/runtime/served_room.py"]
+    )
     assert [kind for kind in get_args(EventKind) if kind not in written] == []
     table = {name for cell in first_cells(section(FILES, "events.jsonl")) for name in codes(cell)}
     assert table == set(get_args(EventKind))

@@ -1,4 +1,5 @@
-"""The processes, their threads and queues: `agent.AgentRun`, `edge.EdgeRun`, `mapper_process`.
+"""The processes, their threads and queues: `agent.AgentRun`, `edge.EdgeRun` with its `served_room`,
+`mapper_process`.
 
 Without an edge: `offline_tracking.track`.
 

@@ -55,6 +55,19 @@ class Blinding:
         }
 
 
+class Unblinded:
+    """An edge outside of blind studies tells everything."""
+
+    def covered(self, report: dict[str, Any]) -> dict[str, Any]:
+        return report
+
+    def covered_event(self, fields: dict[str, Any]) -> dict[str, Any] | None:
+        return fields
+
+    def covered_series(self, series: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        return dict(series)
+
+
 def _covered_agent(agent: Mapping[str, Any]) -> dict[str, Any]:
     covered = _emptied(agent, _RATED)
     if covered.get("merges"):

@@ -1,4 +1,4 @@
-"""A simulated room that tells a live room what happens, as `share.runtime.edge` does."""
+"""A simulated room that tells a live room what happens, as `share.runtime.served_room` does."""
 
 from __future__ import annotations
 

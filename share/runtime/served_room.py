@@ -1,0 +1,323 @@
+"""One room that an edge serves: the state machine of its agents, its mapper, and the writer of its map file.
+
+host (share.runtime.edge) -> EdgeProtocol
+    -> mapper process (share.runtime.mapper_process) -> map events -> EdgeProtocol -> host
+    -> map writer thread (share.runtime.map_writer) -> saved changes -> acknowledgements
+or with policy `streamed`
+host -> TrackingEdge -> a process per agent (share.runtime.tracker_processes) -> poses -> TrackingEdge -> host
+"""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from share.config import Config
+from share.errors import StoreError
+from share.event_kinds import EventKind
+from share.protocol.agent_health import trouble_lines
+from share.protocol.common_events import Tick
+from share.protocol.edge import EdgeProtocol
+from share.protocol.edge_events import (
+    AddKeyframe,
+    AddRun,
+    ChangesSaved,
+    DropRun,
+    EdgeEffect,
+    EdgeEvent,
+    MapperResult,
+    SaveChanges,
+    SendToPeer,
+    SetCredential,
+    SetPresence,
+    StartTracker,
+    StopTracker,
+    TrackerAnswered,
+    TrackerLost,
+    TrackerReady,
+    TrackFrame,
+    WriteEvent,
+)
+from share.protocol.edge_records import SessionTotals
+from share.protocol.peer import RestoredRun
+from share.protocol.remote_tracking import TrackingEdge
+from share.runtime.blinding import Blinding, Unblinded
+from share.runtime.edge_observer import EdgeObserver
+from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
+from share.runtime.map_writer import MapWriter
+from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
+from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
+from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
+from share.runtime.worker_process import WorkerProcess
+from share.scheduling.policies import POLICIES
+from share.store.map_store import MapStore
+from share.wire.layouts import Bytes
+from share.wire.messages import PoseUpdate
+
+_DRAIN_S = 0.5  # wait for the map writer of a session that is over
+
+
+class RoomHost(Protocol):
+    """What a room needs of the edge around it. All but `wake` are called from the edge's loop."""
+
+    def wake(self) -> None:
+        """Have `ServedRoom.step` called soon. Safe from any thread."""
+
+    def send(self, peer_id: bytes, frames: Sequence[Bytes]) -> None: ...
+
+    def expect_growth(self, is_expected: bool) -> None:
+        """The memory of this process grows while a stored map is restored."""
+
+    def record(self, fields: dict[str, Any]) -> None:
+        """Log an event of the state machine."""
+
+    def log_event(self, event: EventKind, reason: str) -> None:
+        """Log what happens to the room's processes and files."""
+
+
+@dataclass(frozen=True)
+class _MapNotice:
+    """A line about the map file for the event log, from another thread."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class _MapperDied:
+    """The mapper's process has died."""
+
+    reason: str
+
+
+class ServedRoom:
+    """A room, until `close`.
+
+    start_ns: origin of the times in events. has_keys: agents have keys. Raises StoreError if the map in
+    `store` is unreadable.
+    """
+
+    def __init__(
+        self,
+        settings: Config,
+        host: RoomHost,
+        start_ns: int,
+        store: MapStore | None,
+        observer: EdgeObserver,
+        blinding: Blinding | Unblinded,
+        has_keys: bool,
+    ) -> None:
+        self._settings, self._host, self._start_ns = settings, host, start_ns
+        self._observer, self._blinding = observer, blinding
+        self._restarts = MapperRestarts(store, settings.merge.enter_m, self._log_map, has_keys)
+        self._restart_due_s: float | None = None  # when a session that waits for the disk starts
+        self._restart_reason = ""
+        self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
+        self._stopping = False
+        self._troubles = RecentTroubles()
+        self._other_troubles = RecentTroubles()  # of one agent or map, not of the edge
+        self._totals = SessionTotals()
+        self._start_session(self._load_stored_map())
+
+    def handle(self, event: EdgeEvent) -> None:
+        for effect in self._state_machine.handle(event, time.monotonic_ns()):
+            self._execute(effect)
+
+    def step(self) -> None:
+        """Handle the answers of the room's processes and threads, and the time that has passed."""
+        self._handle_answers()
+        self.handle(Tick())
+        if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
+            self._restart_mapping(self._restart_reason)
+
+    def stop(self) -> None:
+        """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
+        self._stopping = True
+
+    def close(self) -> str | None:
+        """End all processes and threads. Return why the map file is incomplete, None if it is complete."""
+        self._stopping = True
+        if self._mapper_process is not None:
+            self._handover.flush()
+            self._mapper_process.close()
+        self._handle_answers()
+        self._trackers.close()
+        if self._map_writer is None:
+            return None
+        incomplete_reason = self._map_writer.close()
+        self._handle_answers()  # acknowledges what has been saved
+        if incomplete_reason is not None:
+            self._log_map(incomplete_reason)
+        return incomplete_reason
+
+    # ------------------------------------------------------------------ what is shown
+
+    def latest_poses(self) -> dict[str, PoseUpdate]:
+        """Return the newest pose of each present run, by run key."""
+        return self._state_machine.latest_poses()
+
+    def series(self) -> dict[str, Any]:
+        """Return `series` of edge.json."""
+        return self._blinding.covered_series(self._state_machine.series())
+
+    def report(self) -> dict[str, Any]:
+        """Return edge.json without `series` and what only the edge around the room knows."""
+        totals = self._totals.with_totals(self._state_machine.report(self._progress.report))
+        report = self._blinding.covered(totals)
+        map_trouble = None if self._map_writer is None else self._map_writer.trouble
+        return {
+            **report,
+            "refused": [*self._other_troubles.current(), *report["refused"]],
+            "trouble": [*self._troubles.current(), *filter(None, (map_trouble, self._progress.stall()))],
+            "degraded": self._restarts.losses,
+            "agent_trouble": trouble_lines(report["agents"]),
+            **self._progress.last_solve(),
+            **self._restarts.loading(),
+        }
+
+    # ------------------------------------------------------------------ sessions
+
+    def _load_stored_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
+        """Return the map and the agents' runs to start with. Raises StoreError if the map file is
+        unreadable."""
+        if POLICIES[self._settings.edge.policy].streams_frames:
+            return None, []
+        return self._restarts.load_map()
+
+    def _start_session(
+        self, loaded: tuple[RestoreMap | None, list[RestoredRun]], start_delay_s: float = 0.0
+    ) -> None:
+        """Start a new session: agents see its new number and resend what the map lacks.
+
+        start_delay_s: delay of the mapper's start.
+        """
+        self._progress = MapperProgress()
+        self._mapper_process: WorkerProcess | None = None
+        self._map_writer: MapWriter | None = None
+        self._trackers = TrackerProcesses(self._settings, self._post)
+        self._handover: KeyframeHandover  # where there is a mapper
+        self._state_machine: EdgeProtocol
+        if POLICIES[self._settings.edge.policy].streams_frames:
+            self._state_machine = TrackingEdge(
+                self._settings, secrets.randbits(63), began_ns=self._start_ns, capacity=tracker_capacity()
+            )
+        else:
+            self._start_mapping(*loaded, start_delay_s)
+        self._host.expect_growth(loaded[0] is not None)  # until the mapper has it
+        store = self._restarts.store
+        self._observer.begin_session(None if store is None else store.path, loaded[1])
+
+    def _start_mapping(
+        self, restore: RestoreMap | None, known: list[RestoredRun], start_delay_s: float
+    ) -> None:
+        store, writable = self._restarts.store, self._restarts.writable
+        session, objects = secrets.randbits(63), self._restarts.objects or ()
+        self._state_machine = EdgeProtocol(self._settings, session, writable, known, self._start_ns, objects)
+        arguments = (self._settings, None if store is None else store.path)
+        self._mapper_process = WorkerProcess(
+            "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
+        )
+        if restore is not None:
+            self._mapper_process.send(restore)
+        self._handover = KeyframeHandover(self._mapper_process.send)
+        if store is not None and writable:
+            self._map_writer = MapWriter(store, self._post, self._post_map_notice)
+
+    def _restart_mapping(self, reason: str) -> None:
+        """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
+        pause_s = self._restarts.record_death()
+        text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
+        self._host.log_event("mapper died", text)
+        self._troubles.add(f"the mapper: {text}", pause_s + TROUBLE_SHOWN_S)
+        if self._mapper_process is not None:
+            self._mapper_process.close()
+        try:
+            if self._map_writer is not None and not self._map_writer.drain(_DRAIN_S):
+                raise StoreError("the disk of the map file does not answer")
+            self._discard_answers()
+            self._restarts.objects = self._state_machine.room.kept_objects()
+            loaded = self._load_stored_map()
+            report = self._state_machine.report(self._progress.report)
+            self._totals.add_session(self._totals.with_totals(report))
+            self._start_session(loaded, pause_s)
+            self._restart_due_s = None
+        except StoreError as error:  # until it can be read, nothing is applied or acknowledged
+            self._log_map(f"{error}; retried in {pause_s:g} s")
+            self._restart_due_s, self._restart_reason = time.monotonic() + pause_s, str(error)
+
+    # ------------------------------------------------------------------ answers and effects
+
+    def _handle_answers(self) -> None:
+        while not self._inbox.empty():
+            match self._inbox.get():
+                case MapperResult() as result:
+                    self.handle(result)
+                    self._observer.add_result(result)
+                case ChangesSaved() | TrackerReady() | TrackerAnswered() as answer:
+                    self.handle(answer)
+                case TrackerLost() as tracker if not self._stopping:
+                    text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
+                    self._other_troubles.add(text)
+                    self.handle(tracker)
+                case KeyframesAdded() as added:
+                    self._handover.record_added(added)
+                case MapperReport() as report:
+                    self._progress.record(report)
+                case _MapNotice() as notice:
+                    self._log_map(notice.text)
+                case MapRestored():
+                    self._restarts.record_restored()
+                    self._host.expect_growth(False)
+                case SolverDied() as solver:
+                    self._host.log_event("solver died", solver.text)
+                    self._troubles.add(f"the solver: {solver.text}")
+                case _MapperDied() as mapper if not self._stopping:
+                    self._restart_mapping(f"its process {mapper.reason}")
+
+    def _discard_answers(self) -> None:
+        """Drop answers to a session that is over; log only its notices."""
+        while not self._inbox.empty():
+            match self._inbox.get():
+                case _MapNotice() as notice:
+                    self._log_map(notice.text)
+
+    def _execute(self, effect: EdgeEffect) -> None:
+        if isinstance(effect, WriteEvent):
+            fields = self._blinding.covered_event(effect.fields)
+            if fields is None:
+                return
+            effect = WriteEvent(fields)
+        self._observer.add_effect(effect)
+        match effect:
+            case SendToPeer():
+                self._host.send(effect.peer_id, effect.frames)
+            case AddKeyframe() if self._mapper_process is not None:
+                self._handover.add(effect)
+            case AddRun() | SetCredential() | SetPresence() | DropRun() if self._mapper_process is not None:
+                self._mapper_process.send(effect)
+            case StartTracker() | TrackFrame() | StopTracker():
+                self._trackers.execute(effect)
+            case SaveChanges() if self._map_writer is not None:
+                self._map_writer.submit(effect)
+            case WriteEvent():
+                self._host.record(effect.fields)
+                if effect.fields["event"] == "step failed" and effect.fields["agent"] is None:
+                    self._other_troubles.add(effect.fields["reason"])
+
+    def _log_map(self, reason: str) -> None:
+        self._host.log_event("map", reason)
+
+    # ------------------------------------------------------------------ from other threads
+
+    def _post(self, message: object) -> None:
+        self._inbox.put(message)
+        self._host.wake()
+
+    def _post_map_notice(self, text: str) -> None:
+        self._post(_MapNotice(text))
+
+    def _post_mapper_died(self, reason: str) -> None:
+        self._post(_MapperDied(reason))
