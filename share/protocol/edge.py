@@ -1,8 +1,8 @@
 """The edge's side of the protocol as a state machine: admission, acknowledgements, corrections.
 
 It uses no socket, thread, disk or clock: `EdgeProtocol.handle` returns effects, which
-`share.runtime.served_room` carries out. The mapper (`share.mapping.mapper`) runs in its own process and answers with map events; the map
-writer stores what must survive a crash and answers once it is on the disk.
+`share.runtime.served_room` carries out. The mapper (`share.mapping.mapper`) runs in its own process and
+answers with map events; the map writer stores what must survive a crash and answers once it is on the disk.
 """
 
 from __future__ import annotations
