@@ -123,7 +123,7 @@ class Person:
 
 
 class ModelRun:
-    """One life of the edge: both machines, as `share.runtime.edge` has them, without processes."""
+    """One life of the edge: both machines, as `share.runtime.served_room` has them, without processes."""
 
     def __init__(self, config: Config, session: int) -> None:
         self.machine = EdgeProtocol(config, session)

@@ -19,6 +19,7 @@ from share.net.transport import IncomingMessage
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
 from share.runtime import edge as edge_module
+from share.runtime import served_room
 from share.runtime.edge import EdgeRun
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
@@ -78,7 +79,7 @@ def edge(path, monkeypatch):
     runs = []
 
     def make(mapper):
-        monkeypatch.setattr(edge_module, "run_mapper", mapper)
+        monkeypatch.setattr(served_room, "run_mapper", mapper)
         died = MapperRestarts.record_death
         monkeypatch.setattr(
             MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
@@ -154,7 +155,7 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
             self._answer(ChangesSaved(10**6))
             return super().drain(timeout_s)
 
-    monkeypatch.setattr(edge_module, "MapWriter", Writer)
+    monkeypatch.setattr(served_room, "MapWriter", Writer)
     monkeypatch.setattr(
         EdgeProtocol, "handle", lambda self, event, now: handled.append(event) or handle(self, event, now)
     )
@@ -329,13 +330,13 @@ def test_counters_continue_after_a_mapper_died(edge):
 
 def test_a_dead_tracker_is_trouble_of_its_agent(monkeypatch):
     """Not the edge's: else an agent could make /health 503 by its frames."""
-    made = edge_module.TrackerProcesses
+    made = served_room.TrackerProcesses
 
     def with_a_dead_one(settings, on_answer):
         on_answer(TrackerLost("ann-0001", 0, "was ended by SIGKILL"))
         return made(settings, on_answer)
 
-    monkeypatch.setattr(edge_module, "TrackerProcesses", with_a_dead_one)
+    monkeypatch.setattr(served_room, "TrackerProcesses", with_a_dead_one)
     run = EdgeRun(Config(edge=EdgeConfig(policy="streamed")), Link(), None, lambda fields: None)
     thread = threading.Thread(target=run.run)
     thread.start()
