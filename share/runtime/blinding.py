@@ -55,8 +55,8 @@ class Blinding:
         }
 
 
-class Unblinded:
-    """An edge outside of blind studies tells everything."""
+class NoBlinding:
+    """Covers nothing: for an edge outside a blind study."""
 
     def covered(self, report: dict[str, Any]) -> dict[str, Any]:
         return report
@@ -64,8 +64,8 @@ class Unblinded:
     def covered_event(self, fields: dict[str, Any]) -> dict[str, Any] | None:
         return fields
 
-    def covered_series(self, series: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        return dict(series)
+    def covered_series(self, series: dict[str, Any]) -> dict[str, Any]:
+        return series
 
 
 def _covered_agent(agent: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from share.errors import StoreError
 from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
 from share.protocol.edge_events import PeerMessageReceived
-from share.runtime.blinding import Blinding, Unblinded
+from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.run_files import EdgeFiles
@@ -67,7 +67,7 @@ class EdgeRun:
         self._guard = FaultGuard(lambda text: self.log_event("internal error", text))
         has_keys = link.agent_names("") is not None
         self._room = ServedRoom(
-            settings, self, self._start_ns, store, self._observer, blinding or Unblinded(), has_keys
+            settings, self, self._start_ns, store, self._observer, blinding or NoBlinding(), has_keys
         )
 
     def stop(self) -> None:

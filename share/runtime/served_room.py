@@ -45,7 +45,7 @@ from share.protocol.edge_events import (
 from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
-from share.runtime.blinding import Blinding, Unblinded
+from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.map_writer import MapWriter
@@ -107,7 +107,7 @@ class ServedRoom:
         start_ns: int,
         store: MapStore | None,
         observer: EdgeObserver,
-        blinding: Blinding | Unblinded,
+        blinding: Blinding | NoBlinding,
         has_keys: bool,
     ) -> None:
         self._settings, self._host, self._start_ns = settings, host, start_ns
