@@ -142,11 +142,10 @@ RoomEvent = (
 MAX_KEYFRAMES = 5000  # some kB each
 
 
-class Recap:
-    """Follows the events of a session, to tell a live room that starts again what is there.
+class SessionSnapshot:
+    """The state of a session as the fewest events that lead to it, for a live room that is started again.
 
-    Without how it came to be: pictures are left out, and all but the newest keyframes; with a map file, the
-    room reads the older ones there.
+    It has no pictures, and the newest keyframes only; with a map file the live room reads the older ones there.
     """
 
     def __init__(self) -> None:
