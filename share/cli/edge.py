@@ -240,7 +240,7 @@ class _EdgePages:
         token: str | None,
         access: EdgeAccess | None,
     ) -> None:
-        from share.runtime.plan import Plan
+        from share.runtime.room_plan import RoomPlan
         from share.runtime.status_server import StatusServer
         from share.view.viewer import LiveRoom
 
@@ -251,7 +251,7 @@ class _EdgePages:
         self._room: LiveRoom | None = None
         self._headset: HeadsetPage | None = None
         if served.http is not None:
-            plan = Plan()
+            plan = RoomPlan()
             status = StatusServer(served.http, self._report, stderr.print_line, token, plan.report)
             stack.callback(status.close)
             self.observers.append(plan)

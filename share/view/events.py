@@ -145,7 +145,7 @@ MAX_KEYFRAMES = 5000  # some kB each
 class SessionSnapshot:
     """The state of a session as the fewest events that lead to it, for a live room that is started again.
 
-    It has no pictures, and the newest keyframes only; with a map file the live room reads the older ones there.
+    It has no pictures, and the newest keyframes only; with a map file the live room reads older ones there.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The floor of the drawn room, below the points of its maps."""
+"""The floor of the drawn room, a grid below the points of its maps."""
 
 from __future__ import annotations
 
