@@ -43,5 +43,5 @@ def edge_settings(
 
 
 def condition_text(settings: Config, blinding: Blinding | None) -> str:
-    """Return what an edge runs by, as it says it at its start."""
+    """Return the policy or condition of an edge, as printed at its start."""
     return f"policy {settings.edge.policy}" if blinding is None else f"condition {blinding.label}"

@@ -159,7 +159,7 @@ def edge(
 
 
 class _PageOptions(NamedTuple):
-    """What the edge serves to browsers. out: folder for what headset pages measure."""
+    """The pages that the edge serves. out: folder for measurements of headset pages."""
 
     http: str | None
     view: str | None

@@ -1,5 +1,5 @@
-"""What is shown of a run that plays: its edge's pages, opened where there is a screen, and the room as text
-where there is a terminal."""
+"""Display of a run while it plays: its edge's pages, opened where there is a screen, and the room as text in
+a terminal."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 class RunScreen:
-    """Shows a run. `pages`: what its edge serves meanwhile; None: nothing.
+    """Shows a run. `pages`: the pages that its edge serves; None: none.
 
-    has_pages: say where they are, and open the first where there is somebody to see it. may_draw: draw the
-    room as text where there is a terminal for it, else one line.
+    has_pages: print their addresses, and open the first where there is a screen. may_draw: draw the room as
+    text where the terminal is large enough, else one line.
     """
 
     def __init__(self, has_pages: bool, may_draw: bool = True) -> None:

@@ -50,7 +50,7 @@ _SHARED_AGENTS = 12
     metavar="tcp://HOST:PORT",
     help="Spread trials over the workers of this dask scheduler, which share the disk.",
 )
-@click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print what is there.")
+@click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print the results so far.")
 @options.out_folder
 def simulate(
     participants: int,

@@ -1,4 +1,4 @@
-"""The edge's part in commanding robots: it checks who may, and passes on. The bridge decides what is safe."""
+"""The edge's part in commanding robots: it checks rights and forwards. The bridge decides what is safe."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from share.wire.room_messages import (
     RobotPlace,
 )
 
-GONE_S = 10.0  # a goal whose robot has no bridge for so long is ended
+GONE_S = 10.0  # without a bridge of its robot for so long a goal ends
 _MAX_PASSED = 4096  # commands; those under way are repeated twice a second
 
 

@@ -99,14 +99,14 @@ class DurabilityTracker:
 
 
 class EventSubject(Protocol):
-    """Whoever caused an event: an agent's run, or a client."""
+    """The subject of an event: an agent's run, or a client."""
 
     @property
     def name(self) -> str: ...
 
 
 class CountedSender(EventSubject, Protocol):
-    """Whose messages are counted."""
+    """A peer with counted messages."""
 
     def count(self, kind: str, reason: str, now_ns: int) -> int: ...
 

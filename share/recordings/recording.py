@@ -55,7 +55,7 @@ class Source(ABC):
 
     @cached_property
     def losses(self) -> DataLosses:
-        """What could not be read so far and was skipped."""
+        """Unreadable items so far, which were skipped."""
         return DataLosses()
 
     def report(self) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class ForeignMapFrame:
 
 @dataclass(frozen=True)
 class RobotDiscovered:
-    """What is on the DDS domain: numbers of navigation servers and of publishers of odometry in the robot's
+    """Counts on the DDS domain: navigation servers and publishers of odometry in the robot's
     namespace; others: other namespaces with a server. release: humble, jazzy, newer; "" unknown. is_fast_dds:
     whether the servers use Fast DDS. has_participants: whether there is anybody on the domain."""
 

@@ -59,7 +59,7 @@ def read_and_repair(path: Path) -> OpenedMap:
 
 
 def damage_text(renamed: Path) -> str:
-    """What happened to a damaged file, which has another name now."""
+    """The fate of a damaged file, which has another name now."""
     return f"the file was damaged; it is kept as {renamed.name}, and its intact rows were taken over"
 
 
@@ -275,7 +275,7 @@ def _present_poses(poses: SavePoses, known_keys: set[KeyframeKey]) -> SavePoses:
     )
 
 
-# ---- Repair of keyframes whose reference is missing
+# ---- Repair of keyframes without their reference
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ class AgentBody:
 
 @dataclass(frozen=True)
 class Picture:
-    """What the agent `name` saw at its newest keyframe, a JPEG."""
+    """The picture of the newest keyframe of agent `name`, a JPEG."""
 
     name: str
     jpeg: bytes

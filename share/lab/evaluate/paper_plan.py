@@ -1,4 +1,4 @@
-"""What `share evaluate paper` plays: sessions, policies, gains; a quick form and the whole of it."""
+"""The runs of `share evaluate paper`: sessions, policies, gains; a quick form and the whole."""
 
 from __future__ import annotations
 

@@ -108,8 +108,8 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class RunPages:
-    """What the edge of a run serves to browsers. has_view: the live room beside the status page. show: is
-    called with a line for each page that says where it is."""
+    """The pages that the edge of a run serves. has_view: the live room beside the status page. show: is
+    called with a line with the address of each page."""
 
     has_view: bool
     show: Callable[[str], None]

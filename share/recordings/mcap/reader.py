@@ -234,6 +234,6 @@ def read_imu(file: MessageFile, progress: Callable[[int, int], None], losses: Da
 
 
 def unwrap_stamps(stamps_ns: I64) -> I64:
-    """Unwrap the stamps (N,) ns of a D4xx, whose counter restarts every 71 minutes."""
+    """Unwrap the stamps (N,) ns of a D4xx: its counter restarts every 71 minutes."""
     back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < -WRAP_NS // 2
     return np.asarray(stamps_ns + WRAP_NS * np.cumsum(back), np.int64)
