@@ -21,7 +21,7 @@ def edge_settings(
     policy: --policy. blind: --blind, KEY:LETTER. Raises ConfigError, UsageError."""
     if blind is None:
         return options.load_config(config_file, [policy]), None
-    from share.config import Config, with_policy
+    from share.config import STREAMED, Config, with_policy
     from share.files.yaml_file import read_given_settings
     from share.lab.study.plan import read_key, sealed_settings
     from share.runtime.blinding import Blinding
@@ -39,6 +39,8 @@ def edge_settings(
     if letter not in key.policies:
         raise UsageError(f"--blind {blind}: the key has no '{letter}', only {', '.join(key.policies)}")
     blinded = with_policy(config, key.policies[letter])
+    if blinded.edge.policy == STREAMED:
+        raise UsageError(f"--blind: condition {letter} builds no map, so no robot drives by it")
     return blinded, Blinding(letter, key.seal(sealed_settings(blinded)))
 
 
