@@ -1,8 +1,8 @@
-"""WebSocket connections that cannot cost their server much, for `websockets.asyncio.server.serve`.
+"""WebSocket connections of bounded cost to their server, for `websockets.asyncio.server.serve`.
 
-A connection counts from its `accept()` on, before TLS, not from its first message. What waits too long, or
-sends more than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets
-that of one that has long had it: who reads for ever cannot be told apart from who only holds a place. Some
+A connection counts from its `accept()` on, before TLS, not from its first message. One that waits too long or
+sends too much is closed before its data are parsed. When all places are taken, a newcomer replaces a
+connection that has long had its place: a reader cannot be told from a peer that only holds a place. Some
 places may be kept for programs of the server's own machine.
 """
 

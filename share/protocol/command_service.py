@@ -28,9 +28,9 @@ _MAX_PASSED = 4096  # commands; those under way are repeated twice a second
 
 
 class CommandService:
-    """Passes commands to the bridges of robots, and what they say to commanders and all that want robots.
+    """Forwards commands to the bridges of robots, and their states to commanders and all that want robots.
 
-    places: where each robot was last. A bridge speaks only of the commands that were passed to it."""
+    places: last position of each robot. A bridge reports only on commands that were forwarded to it."""
 
     def __init__(self, out: EdgeOutput, clients: ClientRegistry, maps: KnownMaps) -> None:
         self._out, self._clients, self._maps = out, clients, maps

@@ -1,6 +1,6 @@
 """The interface of all recordings and cameras: a rig, streams of measurements, perhaps ground truth.
 
-`Source` is what a tracker reads; `Recording` one on disk, of which a span of frames is read; `FolderSource`
+A tracker reads a `Source`. A `Recording` is one on disk, of which a range of frames is read; a `FolderSource`
 one of image files.
 """
 

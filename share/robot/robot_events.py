@@ -102,7 +102,7 @@ class GotoRequested:
 
 @dataclass(frozen=True)
 class CancelRequested:
-    """A commander, any, wants the robot to stop. cancel_id (16 bytes): a final `GoalReport` on it follows;
+    """Any commander wants the robot to stop. cancel_id (16 bytes): a final `GoalReport` on it follows;
     empty: nobody waits for one."""
 
     commander: str

@@ -68,9 +68,9 @@ class _Pause:
 
 
 class AcceptanceRun:
-    """Collects what is measured. tell: is called with a line for the person. show: with the live line.
+    """Collects the measurements. tell: is called with a line for the person. show: with the live line.
 
-    arrived_ns: returns when a live camera's image of a stamp arrived, monotonic; None of a recording.
+    arrived_ns: returns the arrival of a live camera's image by its stamp, monotonic; None for a recording.
     """
 
     def __init__(

@@ -91,7 +91,7 @@ class _MapperDied:
 
 class EdgeRun:
     """One run of the edge, until `stop`. Writes events.jsonl as events happen and edge.json at the end to
-    `out`. allowed: what every client may do where no keys say it. blinding: of a study."""
+    `out`. allowed: rights of every client of an edge without keys. blinding: of a study."""
 
     def __init__(
         self,

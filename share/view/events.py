@@ -17,7 +17,7 @@ REFUSALS = frozenset(("merge skipped", "loop refused", "loop not accepted"))
 
 @dataclass(frozen=True)
 class SessionBegun:
-    """The map starts anew. map_file: what it continues with; None: nothing."""
+    """The map starts anew. map_file: the map that it continues; None: none."""
 
     map_file: Path | None = None
 
