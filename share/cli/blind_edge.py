@@ -21,7 +21,7 @@ def edge_settings(
     policy: --policy. blind: --blind, KEY:LETTER. Raises ConfigError, UsageError."""
     if blind is None:
         return options.load_config(config_file, [policy]), None
-    from share.config import Config, with_policy
+    from share.config import STREAMED, Config, with_policy
     from share.files.yaml_file import read_given_settings
     from share.lab.study.plan import read_key, sealed_settings
     from share.runtime.blinding import Blinding
@@ -39,9 +39,11 @@ def edge_settings(
     if letter not in key.policies:
         raise UsageError(f"--blind {blind}: the key has no '{letter}', only {', '.join(key.policies)}")
     blinded = with_policy(config, key.policies[letter])
+    if blinded.edge.policy == STREAMED:
+        raise UsageError(f"--blind: condition {letter} builds no map, so no robot drives by it")
     return blinded, Blinding(letter, key.seal(sealed_settings(blinded)))
 
 
 def condition_text(settings: Config, blinding: Blinding | None) -> str:
-    """Return what an edge runs by, as it says it at its start."""
+    """Return the policy or condition of an edge, as printed at its start."""
     return f"policy {settings.edge.policy}" if blinding is None else f"condition {blinding.label}"

@@ -1,4 +1,4 @@
-"""`share calibrate headset`: where a headset's own tracking sits on the device it carries, and its clock."""
+"""`share calibrate headset`: the pose of a headset's viewer on the device it carries, and its clock."""
 
 from __future__ import annotations
 

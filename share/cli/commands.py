@@ -32,7 +32,7 @@ COMMANDS = {
     "dataset forget": (
         "share.cli.dataset_forget",
         "forget",
-        "Delete agents, or what is old, from a map for good.",
+        "Delete agents or old keyframes from a map for good.",
     ),
     "sync": ("share.cli.sync", "sync", "Give all machines of a room one clock, and check it."),
     "doctor": ("share.cli.doctor", "doctor", "Check this device, and say how to fix what is missing."),
@@ -51,7 +51,7 @@ COMMANDS = {
     "evaluate paper": (
         "share.cli.evaluate_paper",
         "paper",
-        "Each table and figure of the paper, beside what is measured here.",
+        "Each table and figure of the paper, beside those measured here.",
     ),
     "evaluate compare": ("share.cli.evaluate_compare", "compare", "Compare SHARE's tracker with others."),
     "train": ("share.cli.train", "train", "Train the model that estimates the tracking error."),

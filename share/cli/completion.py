@@ -1,4 +1,4 @@
-"""What a shell completes for options whose values are no fixed choice: names that SHARE knows, and files."""
+"""Shell completion of options without a fixed choice: names that SHARE knows, and files."""
 
 from __future__ import annotations
 

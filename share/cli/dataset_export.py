@@ -1,4 +1,4 @@
-"""What `share dataset export` does with each kind of source and format."""
+"""`share dataset export` for each kind of source and format."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class _Age(click.ParamType[float]):
         return float(found[1]) * _UNIT_S[found[2]]
 
 
-@click.command(short_help="Delete agents, or what is old, from a map for good.")
+@click.command(short_help="Delete agents or old keyframes from a map for good.")
 @click.argument("map_file", metavar="MAP", type=options.PATH)
 @click.option("--agent", "agents", multiple=True, metavar="NAME", help="Delete this agent; may be repeated.")
 @click.option(

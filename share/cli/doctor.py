@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     default=".",
     metavar="DIR",
     type=options.PATH,
-    help="Folder for recordings, whose disk is checked.",
+    help="Folder for recordings; its disk is checked.",
 )
 @click.option(
     "--acceptance",

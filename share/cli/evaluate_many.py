@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from share.lab.evaluate.campaign import PlannedRun, WorkerPool
     from share.lab.evaluate.real_time import Progress
     from share.lab.evaluate.report import ReportSection
-    from share.lab.evaluate.sweep import Axis, Point
+    from share.lab.evaluate.sweep import Point, SweepAxis
     from share.lab.evaluate.trial import Trial
 
 many_run_options = options.option_group(
@@ -217,10 +217,10 @@ def sweep(
     from share.files.writing import writable_dir
     from share.lab.evaluate.campaign import Cluster, worker_pool
     from share.lab.evaluate.real_time import RunOptions
-    from share.lab.evaluate.sweep import Axis, grid, plan_sweep, random_points
+    from share.lab.evaluate.sweep import SweepAxis, grid, plan_sweep, random_points
     from share.recordings.session import read_session
 
-    axes = [Axis.parse(text) for text in axis_texts]
+    axes = [SweepAxis.parse(text) for text in axis_texts]
     points = grid(axes) if count is None else random_points(axes, count, seed=0)
     opened = [read_session(folder) for folder in sessions]
     config = options.load_run_config(config_file, [policy], options_given, opened)
@@ -244,7 +244,7 @@ def sweep(
 
 
 def _write_sweep_report(
-    out: Path, axes: list[Axis], points: list[Point], trials: list[Trial], as_json: bool
+    out: Path, axes: list[SweepAxis], points: list[Point], trials: list[Trial], as_json: bool
 ) -> None:
     from share.files.json_file import nan_to_none
     from share.files.writing import atomic_write

@@ -1,5 +1,5 @@
-"""What is shown of a run that plays: its edge's pages, opened where there is a screen, and the room as text
-where there is a terminal."""
+"""Display of a run while it plays: its edge's pages, opened where there is a screen, and the room as text in
+a terminal."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from share.cli.terminal import LiveLine
 
 if TYPE_CHECKING:
     from share.cli.terminal_room import TerminalRoom
-    from share.lab.evaluate.real_time import Pages, Progress
+    from share.lab.evaluate.real_time import Progress, RunPages
 
 
 class RunScreen:
-    """Shows a run. `pages`: what its edge serves meanwhile; None: nothing.
+    """Shows a run. `pages`: the pages that its edge serves; None: none.
 
-    has_pages: say where they are, and open the first where there is somebody to see it. may_draw: draw the
-    room as text where there is a terminal for it, else one line.
+    has_pages: print their addresses, and open the first where there is a screen. may_draw: draw the room as
+    text where the terminal is large enough, else one line.
     """
 
     def __init__(self, has_pages: bool, may_draw: bool = True) -> None:
         from share.cli.terminal_room import has_room
-        from share.lab.evaluate.real_time import Pages
+        from share.lab.evaluate.real_time import RunPages
         from share.view.viewer import MISSING, is_installed
 
         self._live = LiveLine()
@@ -34,7 +34,7 @@ class RunScreen:
         if has_pages and not self._has_view:
             self._live.print_line(f"share: {MISSING}; there is a plain page")
         is_served = has_pages or self._is_text
-        self.pages: Pages | None = Pages(self._has_view, self._show_page) if is_served else None
+        self.pages: RunPages | None = RunPages(self._has_view, self._show_page) if is_served else None
 
     def _show_page(self, line: str) -> None:
         """Take an edge's line that says where a page is."""

@@ -216,7 +216,7 @@ def _poses_address(text: str) -> HostPort:
 
 
 @robot.command(short_help="Find where the camera sits, from a drive in eights.")
-@_robot_file("The robot's YAML file: gets what is found; its height of the camera is kept.")
+@_robot_file("The robot's YAML file: gets the result; its height of the camera is kept.")
 @_poses
 @_agent
 @click.option(
@@ -350,7 +350,7 @@ def cancel(**robot_options: Any) -> None:
     click.echo(last.text)
 
 
-@robot.command(short_help="Show where the robot is and what it does.")
+@robot.command(short_help="Show the robot's position and state.")
 @_domain
 @_namespace
 @_over_wire

@@ -22,7 +22,7 @@ _STOP_S = 1.0  # that an interrupted command waits for the robot's answer
 
 @dataclass(frozen=True)
 class GoalUpdate:
-    """What becomes of a goal, or of the wish to cancel one."""
+    """Progress of a goal, or of its cancellation."""
 
     text: str
     is_reached: bool
@@ -30,8 +30,8 @@ class GoalUpdate:
 
 @dataclass(frozen=True)
 class RobotNews:
-    """What is seen of a robot. fields: for JSON. text: for a person; None: nothing. is_place: where it is,
-    which takes the place of the one before."""
+    """A report of a robot. fields: for JSON. text: for a person; None: nothing. is_place: its position, which
+    replaces the one shown before."""
 
     fields: dict[str, Any]
     text: str | None
@@ -42,13 +42,13 @@ class RobotLink(Protocol):
     """A way to a robot. A goal lives no longer than the iterator of its updates. All raise ShareError."""
 
     def goto(self, x: float, y: float, yaw: float | None, map_id: str | None) -> Iterator[GoalUpdate]:
-        """Send the robot to x, y (m), yaw (rad), and yield what becomes of it up to its end."""
+        """Send the robot to x, y (m), yaw (rad), and yield the goal's progress up to its end."""
 
     def cancel(self) -> Iterator[GoalUpdate]:
-        """Cancel the robot's goal, and yield what it says to that."""
+        """Cancel the robot's goal, and yield the robot's answers."""
 
     def watch(self) -> Iterator[RobotNews]:
-        """Yield where the robot is and what becomes of goals."""
+        """Yield the robot's position and the progress of goals."""
 
 
 # ---------------------------------------------------------------- the bridge of this machine

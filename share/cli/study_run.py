@@ -176,7 +176,7 @@ class TerminalResearcher:
         self._has_ended = True
 
     def _read(self) -> None:
-        """Read past Python's buffer, whose lock a reading thread would hold at the program's end."""
+        """Read without Python's buffer: a reading thread would hold its lock at the program's end."""
         rest = b""
         with contextlib.suppress(OSError, ValueError, AttributeError):
             while data := os.read(sys.stdin.fileno(), 4096):

@@ -50,7 +50,7 @@ _SHARED_AGENTS = 12
     metavar="tcp://HOST:PORT",
     help="Spread trials over the workers of this dask scheduler, which share the disk.",
 )
-@click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print what is there.")
+@click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print the results so far.")
 @options.out_folder
 def simulate(
     participants: int,
@@ -108,7 +108,7 @@ def simulate(
 
 
 def _carry_out(study: SimulatedStudy, jobs: int, scheduler: str | None) -> None:
-    """Carry out what is missing, and say what is done, and how long the rest may take."""
+    """Carry out the missing trials; print the finished ones and an estimate of the time left."""
     from share.lab.evaluate.campaign import Cluster, worker_pool
     from share.lab.study.simulated_run import TimeLeft, estimated_s, run_missing
 

@@ -1,4 +1,4 @@
-"""What a command shows: progress bars and a live line on stderr, silent where that is no terminal; tables."""
+"""Output of commands: progress bars and a live line on stderr, silent if that is no terminal; tables."""
 
 from __future__ import annotations
 

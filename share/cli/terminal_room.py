@@ -63,7 +63,7 @@ class EdgeStatus:
 
 @contextmanager
 def _deadline(connection: socket, seconds: float) -> Iterator[None]:
-    """End a connection whose other side takes longer, however steadily it sends."""
+    """End a connection if its other side takes longer, even if it keeps sending."""
     timer = Timer(seconds, partial(_shut_down, connection))
     timer.daemon = True
     timer.start()

@@ -19,7 +19,7 @@ _BASE_OPTION = click.option(
     "--base",
     metavar="FILE",
     type=options.EXISTING_FILE,
-    help="Model whose backbone is used.  [default: the one shipped with SHARE]",
+    help="Take the backbone of this model.  [default: the one shipped with SHARE]",
 )
 
 

@@ -1,4 +1,4 @@
-"""`-v`, which every command has: where in the code it failed, what is logged, how long it took."""
+"""`-v` of every command: tracebacks, logged lines, times."""
 
 from __future__ import annotations
 

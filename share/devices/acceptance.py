@@ -18,7 +18,7 @@ from share.types import F64, I64, ImuBatch
 
 @dataclass(frozen=True)
 class AcceptanceStep:
-    """What the person does for a part of the time. share: of all of it."""
+    """A task for the person. share: its part of the whole time."""
 
     name: str
     share: float
@@ -211,7 +211,7 @@ def check_tracking(frames: int, tracked: int, lost_s: float, first_pose_s: float
 
 
 def check_latency(p50_ms: float | None, p95_ms: float | None, over_20ms: float | None) -> CheckResult:
-    """over_20ms: share of the frames whose pose came later than that."""
+    """over_20ms: share of the frames with a pose later than that."""
     if p50_ms is None or p95_ms is None or over_20ms is None:
         return fail("pose latency", "no frame came")
     what = f"p50 {p50_ms:.1f} ms, p95 {p95_ms:.1f} ms, {100 * over_20ms:.3g} % over 20 ms"

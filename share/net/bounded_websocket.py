@@ -1,8 +1,8 @@
-"""WebSocket connections that cannot cost their server much, for `websockets.asyncio.server.serve`.
+"""WebSocket connections of bounded cost to their server, for `websockets.asyncio.server.serve`.
 
-A connection counts from its `accept()` on, before TLS, not from its first message. What waits too long, or
-sends more than it has reason to, is closed before it is parsed. Where all places are taken, a newcomer gets
-that of one that has long had it: who reads for ever cannot be told apart from who only holds a place. Some
+A connection counts from its `accept()` on, before TLS, not from its first message. One that waits too long or
+sends too much is closed before its data are parsed. When all places are taken, a newcomer replaces a
+connection that has long had its place: a reader cannot be told from a peer that only holds a place. Some
 places may be kept for programs of the server's own machine.
 """
 
@@ -89,7 +89,7 @@ class PeerConnections:
         self._waiting[accepted] = None
 
     def take_up(self, connection: BoundedConnection) -> None:
-        """Join a connection, whose TLS is there, to its socket."""
+        """Assign a connection to its socket, once its TLS handshake is done."""
         number = connection.transport.get_extra_info("socket").fileno()
         connection.accepted = next((one for one in self._waiting if one.fileno() == number), None)
         if connection.accepted is None:  # its place went to another meanwhile
@@ -168,8 +168,7 @@ class AcceptedSocket(socket.socket):
 
 
 class BoundedListener(socket.socket):
-    """A listener in the place of another, whose sockets are counted by `PeerConnections` as they are
-    accepted."""
+    """A listener that replaces another, and has `PeerConnections` count each accepted socket."""
 
     def __init__(self, listener: socket.socket, connections: PeerConnections) -> None:
         self.connections, self.is_collected, self._count = connections, False, 0
@@ -188,8 +187,8 @@ class BoundedListener(socket.socket):
 class BoundedConnection(ServerConnection):  # type: ignore[misc]
     """A connection counted by `PeerConnections`.
 
-    Given as `create_connection=partial(BoundedConnection, connections=connections)`, to a server whose socket
-    is a `BoundedListener`.
+    Pass `create_connection=partial(BoundedConnection, connections=connections)` to a server on a
+    `BoundedListener`.
     """
 
     def __init__(self, *args: Any, connections: PeerConnections, **options: Any) -> None:
@@ -231,7 +230,7 @@ def _names(plain: socket.socket) -> tuple[Any, Any]:
 
 
 def _holder_of(peer: Any) -> str:
-    """Return whose address it is: of IPv6 the first 64 bits, of which one peer has all the others."""
+    """Return the holder of an address: of IPv6 the first 64 bits, as a peer has all addresses below them."""
     text = str(peer[0]).partition("%")[0] if peer else ""
     return ":".join(ip_address(text).exploded.split(":")[:4]) if ":" in text else text
 

@@ -1,4 +1,4 @@
-"""Who may read what a SHARE process serves over HTTP: this machine's users, or who has a token.
+"""Access to HTTP servers of SHARE processes: for this machine's users, or with a token.
 
 Bound to loopback, a server answers requests for the name localhost only; so no web page reaches it under a
 name of its own (DNS rebinding). On any other address a token is needed. A page of another origin is refused

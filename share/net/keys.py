@@ -125,7 +125,7 @@ class AllowList:
         return bool(self.agents_for(public))
 
     def refusal(self, public: str, address: str) -> str:
-        """Return what is said of a key that may not connect, and what to do."""
+        """Return the refusal of a key that may not connect, and its remedy."""
         if (name := self._was_lent.get(public)) is not None:  # nobody has that key in a file
             return f"a client of '{name}' ({address}): the list has no agent of that name any more"
         what = f"the key '{public}' ({address}) is not authorized"
@@ -141,7 +141,7 @@ class AllowList:
 
 
 class Grant(NamedTuple):
-    """An entry of the list: the machine's name, the agents that its key may act for, and what it may do as a
+    """An entry of the list: the machine's name, the agents that its key may act for, and its rights as a
     client."""
 
     name: str

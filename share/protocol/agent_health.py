@@ -1,4 +1,4 @@
-"""What is wrong with an agent as its edge sees it: late poses, late corrections, a large error, a clock that
+"""Troubles of an agent as its edge sees them: late poses, late corrections, a large error, a clock that
 is not synchronised, keyframes that are not acknowledged.
 
 A low QoE is no trouble: it is what scheduling steers, and falls with each millisecond until a correction.
@@ -57,7 +57,7 @@ class PoseAges:
 
 @dataclass(frozen=True)
 class KindLimits:
-    """What a kind of agent tolerates. pose_ms: usual age of its poses; others as in `Evaluation`."""
+    """Limits of a kind of agent. pose_ms: usual age of its poses; others as in `Evaluation`."""
 
     pose_ms: float
     delay_ms: float

@@ -38,9 +38,9 @@ class LedgerEntry:
 class KeyframeLedger:
     """Keyframes in order of their ids: first those acknowledged, then those pending.
 
-    Only the first `window` pending ones are in flight. One is sent again once the edge has answered something
-    that was sent after it: a link keeps the order, so until then it is on its way, and to send it twice would
-    fill a slow link with copies (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896).
+    Only the first `window` pending ones are in flight. One is resent only after the edge has answered a later
+    message: a link keeps the order, so until then the keyframe is under way, and a copy would only fill a
+    slow link (J. Nagle, *Congestion Control in IP/TCP Internetworks*, RFC 896).
 
     A full ledger drops the oldest acknowledged one (policy drop_oldest_acknowledged); without one, the oldest
     pending one (drop_oldest), and rebases the next keyframe onto the dropped one's reference.

@@ -1,4 +1,4 @@
-"""The clients of an edge: who they are, who may join, what they may send how often."""
+"""The clients of an edge: admission, rights, and limits of their messages."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class ClientService:
         }
 
     def warnings(self) -> list[str]:
-        """Return a line for each client whose messages keep being refused."""
+        """Return a line for each client with repeatedly refused messages."""
         return fault_lines(
             ((f"client '{client.name}'", "messages refused", client.refusals) for client in self.clients),
             self._out.now_ns,

@@ -1,4 +1,4 @@
-"""The edge's part in commanding robots: it checks who may, and passes on. The bridge decides what is safe."""
+"""The edge's part in commanding robots: it checks rights and forwards. The bridge decides what is safe."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from share.wire.room_messages import (
     RobotPlace,
 )
 
-GONE_S = 10.0  # a goal whose robot has no bridge for so long is ended
+GONE_S = 10.0  # without a bridge of its robot for so long a goal ends
 _MAX_PASSED = 4096  # commands; those under way are repeated twice a second
 
 
 class CommandService:
-    """Passes commands to the bridges of robots, and what they say to commanders and all that want robots.
+    """Forwards commands to the bridges of robots, and their states to commanders and all that want robots.
 
-    places: where each robot was last. A bridge speaks only of the commands that were passed to it."""
+    places: last position of each robot. A bridge reports only on commands that were forwarded to it."""
 
     def __init__(self, out: EdgeOutput, clients: ClientRegistry, maps: KnownMaps) -> None:
         self._out, self._clients, self._maps = out, clients, maps

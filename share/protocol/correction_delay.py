@@ -30,8 +30,8 @@ class FilteredDelay:
 class CorrectionDelay:
     """Delay d of one agent, filtered; times by the agent's clock, ns.
 
-    d is the time until the acknowledgement, which every keyframe has, and from there to the correction, which
-    some lead to. A keyframe that is not acknowledged counts as late as it is.
+    d is the time until the acknowledgement, which every keyframe gets, plus that from there to the
+    correction, which only some get. An unacknowledged keyframe counts with its present age.
     """
 
     def __init__(self) -> None:

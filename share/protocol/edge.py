@@ -284,8 +284,8 @@ class EdgeProtocol:
         return peer.report(self._out.now_ns, rating, is_latest)
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
-        """Return edge.json without `series`. map_report: of the mapper, whose `agents` are by run key. Runs
-        go by `RunRegistry.label`."""
+        """Return edge.json without `series`. map_report: of the mapper, with `agents` by run key. Names of
+        runs are `RunRegistry.label`."""
         peers, mapped = self._registry.values(), map_report.get("agents", {})
         return {
             "session": self._session,

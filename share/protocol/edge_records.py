@@ -98,15 +98,15 @@ class DurabilityTracker:
         return self.mark_saved(self._saved_ticket if self._has_store else self._ticket)
 
 
-class Named(Protocol):
-    """Whoever caused an event: an agent's run, or a client."""
+class EventSubject(Protocol):
+    """The subject of an event: an agent's run, or a client."""
 
     @property
     def name(self) -> str: ...
 
 
-class CountedSender(Named, Protocol):
-    """Whose messages are counted."""
+class CountedSender(EventSubject, Protocol):
+    """A peer with counted messages."""
 
     def count(self, kind: str, reason: str, now_ns: int) -> int: ...
 
@@ -156,7 +156,7 @@ class EdgeOutput:
             self.record("bad message", sender, reason, throttled)
 
     def record(
-        self, event: EventKind, peer: Named | None, reason: str, throttled: bool = True, **fields: Any
+        self, event: EventKind, peer: EventSubject | None, reason: str, throttled: bool = True, **fields: Any
     ) -> None:
         """Record an event. throttled: unless it is repeated too often, as a peer could cause it."""
         make = self._event_log.throttled_event if throttled else self._event_log.event

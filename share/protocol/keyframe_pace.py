@@ -82,7 +82,7 @@ class KeyframePace:
         return has_room and self._bucket.take(now_ns, is_preferred)
 
 
-MAX_KEYFRAMES = 3  # a keyframe under way, one at the edge, one whose acknowledgement comes back
+MAX_KEYFRAMES = 3  # one under way, one at the edge, one with its acknowledgement under way
 LATE_MS = 100.0  # an acknowledgement that takes so much longer than the fastest has met a queue
 
 

@@ -19,8 +19,8 @@ _MAX_JOINS = 256  # remembered; the oldest is forgotten
 
 @dataclass(frozen=True, eq=False)
 class MapMoved:
-    """What was in the map `old` is in `new` now. T_new_old (4, 4). is_join: `old` is part of `new` for good;
-    else one agent changed, as where a join is undone."""
+    """The contents of map `old` are in `new` now. T_new_old (4, 4). is_join: `old` is part of `new` for good;
+    else one agent changed its map, as when a join is undone."""
 
     old: str
     new: str

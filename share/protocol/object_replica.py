@@ -1,4 +1,4 @@
-"""What a client holds of the room's objects, by the edge's changes and lists."""
+"""A client's replica of the room's objects, kept by the edge's changes and lists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ObjectReplica:
 
     @property
     def objects(self) -> dict[int, RoomObject]:
-        """What is there, by id."""
+        """The present objects, by id."""
         return {n: one for n, one in (self._earlier | self._held).items() if not one.removed}
 
     def begin_session(self, session: int) -> None:

@@ -158,7 +158,7 @@ class ObjectService:
             self._out.record("objects moved", None, moved, map_id=move.new)
 
     def add_solved(self, map_ids: Collection[str]) -> None:
-        """Remove the objects whose map is gone, by the maps of a solution."""
+        """Remove the objects of maps that a solution no longer has."""
         self._maps.add_solved(map_ids)
         for gone in self.objects.remove_missing(lambda one: one in self._maps, self._out.now_ns):
             self._announce(gone)

@@ -117,7 +117,7 @@ class Faults:
 
 @dataclass(kw_only=True)
 class Sender:
-    """What is counted of the messages of a peer, or of all peers that have not joined together."""
+    """Counts of the messages of a peer, or of all peers that have not joined together."""
 
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Faults = field(default_factory=Faults)  # refused messages
@@ -222,7 +222,7 @@ class Peer(Sender):
 
 
 def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list[str]:
-    """Return a warning line for each sender whose messages or keyframes keep being refused or suspect."""
+    """Return a warning line for each sender with repeatedly refused messages or suspect keyframes."""
     kinds = [("peers that have not joined", "messages refused", unjoined.refusals)]
     for peer in peers:
         kinds.append((f"agent '{peer.name}'", "messages refused", peer.refusals))

@@ -69,7 +69,7 @@ class ObjectChanged:
 
 @dataclass(frozen=True)
 class CommandChanged:
-    """What becomes of a command, of this client or another."""
+    """Progress of a command, of this client or another."""
 
     state: CommandState
 

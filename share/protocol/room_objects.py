@@ -31,7 +31,7 @@ class RoomObjects:
         self._session = session
         self._kept: dict[int, SaveObject] = {}
         self._removed: dict[int, tuple[RoomObject, int]] = {}  # by id: with the time, the oldest first
-        self._missing: set[int] = set()  # objects whose map was not there at the last look
+        self._missing: set[int] = set()  # objects without their map at the last check
         for one in stored:
             if len(self._kept) < MAX_OBJECTS:
                 self._keep(one.object, one.home_map)
@@ -84,7 +84,7 @@ class RoomObjects:
         return out
 
     def remove_missing(self, has_map: Callable[[str], bool], now_ns: int) -> list[RoomObject]:
-        """Remove the objects whose map was not there at the last look either."""
+        """Remove the objects that had no map at the last check either."""
         missing = {one.object.object_id for one in self._kept.values() if not has_map(one.object.map_id)}
         gone, self._missing = missing & self._missing, missing
         maps = {object_id: self._kept[object_id].object.map_id for object_id in gone}

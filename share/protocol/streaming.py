@@ -1,5 +1,5 @@
-"""The agent whose frames the edge tracks (policy streamed): it sends them through a bounded window, in which
-the newest frame waits."""
+"""An agent that has the edge track its frames (policy streamed): it sends them through a bounded window, in
+which the newest frame waits."""
 
 from __future__ import annotations
 
@@ -162,8 +162,8 @@ class FrameStreamer:
 
 
 class StreamingAgent(AgentProtocol):
-    """An `AgentProtocol` whose frames the edge tracks. It takes `FrameArrived` and sends neither poses nor
-    keyframes."""
+    """An `AgentProtocol` that has the edge track its frames. It takes `FrameArrived` and sends neither poses
+    nor keyframes."""
 
     offline_text = "no tracking without the edge"
     slow_text = "the edge does not answer"

@@ -70,7 +70,7 @@ def _own_rig(root: Path) -> Rig:
 
 
 def _euroc_images(folder: Path, camera: Camera, losses: DataLosses) -> list[tuple[int, LazyImage]]:
-    """Return stamp and image of each line of data.csv whose file exists."""
+    """Return stamp and image of each line of data.csv that has its file."""
     listing, data = folder / "data.csv", folder / "data"
 
     def parse(fields: list[str], where: str) -> tuple[int, str]:

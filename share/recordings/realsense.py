@@ -29,7 +29,7 @@ from share.recordings.calibration_match import device_mismatch, fit_to_recording
 from share.recordings.images import EncodedImage
 from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
-from share.recordings.recording import Recording, select_span
+from share.recordings.recording import Recording, select_time_range
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, Measurement
 from share.sensors.profile import load_profile
 from share.sensors.sample_processor import ACCEL, GYRO, DeviceSample, SampleProcessor
@@ -76,7 +76,7 @@ class RealSenseRecording(Recording):
         self.notes, self.serial, self._file = notes, file.serial, file
         unit = f"{file.streams.get(DEPTH, '').rpartition('/')[0]}/option/Depth_Units/value"
         self._depth_scale = 1 / file.read_number(unit, None, 0.001, *_UNIT_RANGE_M)
-        self.span = select_span(self.all_stamps()[CAM0], frames, str(file.path), rig.timeshift_ns)
+        self.time_range = select_time_range(self.all_stamps()[CAM0], frames, str(file.path), rig.timeshift_ns)
 
     def all_stamps(self) -> dict[str, I64]:
         return self._stamps

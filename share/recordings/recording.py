@@ -1,6 +1,6 @@
 """The interface of all recordings and cameras: a rig, streams of measurements, perhaps ground truth.
 
-`Source` is what a tracker reads; `Recording` one on disk, of which a span of frames is read; `FolderSource`
+A tracker reads a `Source`. A `Recording` is one on disk, of which a range of frames is read; a `FolderSource`
 one of image files.
 """
 
@@ -55,7 +55,7 @@ class Source(ABC):
 
     @cached_property
     def losses(self) -> DataLosses:
-        """What could not be read so far and was skipped."""
+        """Unreadable items so far, which were skipped."""
         return DataLosses()
 
     def report(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ class Source(ABC):
         return float(1e9 / np.median(steps)) if len(steps) else 0.0
 
 
-class Span(NamedTuple):
+class TimeRange(NamedTuple):
     """A part of a recording, ns: images in (image_from, image_to], IMU samples in (imu_from, imu_to]."""
 
     image_from: int
@@ -87,10 +87,10 @@ class Span(NamedTuple):
 
 
 UNBOUNDED_NS = 2**62  # limit of a span without an end
-WHOLE = Span(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
+WHOLE = TimeRange(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
 
 
-def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
+def select_time_range(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> TimeRange:
     """Return the span of cam0's images number `frames`, with the IMU samples since the image before them.
 
     cam0 (N,): stamps of its images, ns. imu_shift_ns: IMU time minus camera time. Raises DataError without
@@ -106,7 +106,7 @@ def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int =
         raise UsageError(f"{where}: --frames {requested} selects nothing; it has {len(cam0)} frames")
     previous_ns = int(cam0[first - 1]) if first else -UNBOUNDED_NS
     last_ns = int(cam0[last - 1])
-    return Span(
+    return TimeRange(
         image_from=(previous_ns + int(cam0[first])) // 2 if first else -UNBOUNDED_NS,
         image_to=(last_ns + int(cam0[last])) // 2 if last < len(cam0) else UNBOUNDED_NS,
         imu_from=previous_ns + imu_shift_ns,
@@ -117,7 +117,7 @@ def select_span(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int =
 class Recording(Source):
     """A recording on disk, of which `span` is read."""
 
-    span: Span = WHOLE
+    time_range: TimeRange = WHOLE
 
     @abstractmethod
     def all_stamps(self) -> dict[str, I64]:
@@ -126,12 +126,12 @@ class Recording(Source):
     def stamps(self) -> dict[str, I64]:
         out = {}
         for stream, stamps in self.all_stamps().items():
-            lo, hi = self.span.limits(stream)
+            lo, hi = self.time_range.limits(stream)
             out[stream] = stamps[(stamps > lo) & (stamps <= hi)]
         return out
 
     def is_in_span(self, stream: str, stamp_ns: int) -> bool:
-        lo, hi = self.span.limits(stream)
+        lo, hi = self.time_range.limits(stream)
         return lo < stamp_ns <= hi
 
 
@@ -139,7 +139,7 @@ class FolderSource(Recording):
     """A recording in files.
 
     images: (stamp ns, image) of each stream. imu: stamps (N,) ns, values (N, 6). frames: the images of cam0
-    to read. Raises DataError, UsageError as `select_span`.
+    to read. Raises DataError, UsageError as `select_time_range`.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class FolderSource(Recording):
     ) -> None:
         self.name, self.rig, self.notes, self.losses = path.resolve().name, rig, notes, losses
         self.images, self.imu, self._read_truth = images, imu, read_truth
-        self.span = select_span(self.all_stamps()[CAM0], frames, self.name, rig.timeshift_ns)
+        self.time_range = select_time_range(self.all_stamps()[CAM0], frames, self.name, rig.timeshift_ns)
 
     def all_stamps(self) -> dict[str, I64]:
         stamps = {

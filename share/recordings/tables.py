@@ -79,7 +79,7 @@ def parse_rows(
     parse: Callable[[list[str], str], Row],
     losses: DataLosses | None = None,
 ) -> tuple[I64, list[Row]]:
-    """Parse the fields of each line; return stamps (N,) and the rows, whose first item is the stamp.
+    """Parse the fields of each line; return stamps (N,) and the rows, with the stamp as first item.
 
     Lines that `parse` refuses (DataError) and lines out of order go to `losses`. Raises DataError if losses
     is None, or more than 5 % are lost.
@@ -102,7 +102,7 @@ def parse_rows(
 def _ordered_mask(
     path: Path, stamps: I64, lines: Sequence[int], losses: DataLosses | None
 ) -> NDArray[np.bool_]:
-    """Return the largest set of rows (N,) whose stamps never decrease; the others go to `losses`.
+    """Return the largest set of rows (N,) with stamps that never decrease; the others go to `losses`.
 
     Equal stamps stay: the sequencer drops and counts them. Raises DataError if rows are out of order and
     losses is None.

@@ -1,7 +1,7 @@
 """The robot bridge as a state machine: poses and odometry in, `map → odom` and goals out.
 
-Nothing moves but by a goal that was allowed, in the map in which it was given, while the robot's place in
-it is known. What takes that away stops the robot, and a line says what it was.
+The robot moves only by an allowed goal, in the map in which it was given, while its pose there is known. When
+one of these conditions ends, the robot stops, and a line says which.
 """
 
 from __future__ import annotations

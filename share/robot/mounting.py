@@ -1,4 +1,4 @@
-"""Where the agent's body sits on the robot, from a drive that turns to both sides: hand-eye on the floor.
+"""The pose of the agent's body on the robot, from a drive that turns to both sides: hand-eye on the floor.
 
 The base moves along its own x axis by what its wheels count; the body's heading is that of the base but for a
 constant. So over any piece of the way, as complex numbers on the floor,
@@ -60,7 +60,7 @@ class DriveExtent:
 
     @property
     def missing(self) -> str | None:
-        """What has to be driven yet; None if it is enough."""
+        """The motion that the drive still lacks; None if it suffices."""
         if min(self.left_deg, self.right_deg) < _MIN_TURN_DEG:
             done = f"{self.left_deg:.0f}° to the left and {self.right_deg:.0f}° to the right so far"
             return f"turn by {_MIN_TURN_DEG:.0f}° and more to both sides, as in a figure of eight; {done}"
@@ -117,7 +117,7 @@ def find_mounting(drive: MountingDrive, height_m: float = 0.0) -> Mounting:
     spread = fits[1:] - fits[1:].mean(0)
     sigma = np.sqrt((len(spread) - 1) / len(spread) * (spread**2).sum(0))  # the jackknife's
     if not (np.isfinite(fits).all() and np.isfinite(sigma).all()):
-        raise DataError("no mounting fits this drive, whose odometry has values of no robot; drive again")
+        raise DataError("no mounting fits this drive: its odometry has values of no robot; drive again")
     if abs(scale) > _MAX_SCALE:
         raise DataError(
             f"camera and wheels differ by {100 * abs(scale):.0f} % of the way: are both this robot's, "

@@ -85,8 +85,7 @@ class NavigateClient:
         return bool(self._goal.get_matched_subscriptions()) and bool(self._cancel.get_matched_subscriptions())
 
     def user_data(self) -> tuple[bytes | None, bytes | None]:
-        """Return what the publishers of results and of feedback tell about themselves; None before they are
-        found."""
+        """Return the user data of the publishers of results and of feedback; None before they are found."""
         return _user_data(self._results), _user_data(self._feedback)
 
 

@@ -42,8 +42,7 @@ def wrapped(angle: float) -> float:
 
 
 def flattened(T: F64) -> PlanarPose:
-    """Return a pose (4, 4) in a frame whose z is up without its height and tilt: the yaw is the heading of
-    its x axis."""
+    """Return a pose (4, 4) in a z-up frame without its height and tilt. yaw: heading of its x axis."""
     return PlanarPose(float(T[0, 3]), float(T[1, 3]), math.atan2(float(T[1, 0]), float(T[0, 0])))
 
 
@@ -55,5 +54,5 @@ def between(a: PlanarPose, b: PlanarPose, u: float) -> PlanarPose:
 
 
 def yaw_of_quaternion(x: float, y: float, z: float, w: float) -> float:
-    """Return the heading, rad, of the x axis of a frame whose rotation is this quaternion."""
+    """Return the heading, rad, of the x axis of a frame with this rotation."""
     return math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)

@@ -75,7 +75,7 @@ class ForeignMapFrame:
 
 @dataclass(frozen=True)
 class RobotDiscovered:
-    """What is on the DDS domain: numbers of navigation servers and of publishers of odometry in the robot's
+    """Counts on the DDS domain: navigation servers and publishers of odometry in the robot's
     namespace; others: other namespaces with a server. release: humble, jazzy, newer; "" unknown. is_fast_dds:
     whether the servers use Fast DDS. has_participants: whether there is anybody on the domain."""
 
@@ -102,7 +102,7 @@ class GotoRequested:
 
 @dataclass(frozen=True)
 class CancelRequested:
-    """A commander, any, wants the robot to stop. cancel_id (16 bytes): a final `GoalReport` on it follows;
+    """Any commander wants the robot to stop. cancel_id (16 bytes): a final `GoalReport` on it follows;
     empty: nobody waits for one."""
 
     commander: str

@@ -26,7 +26,7 @@ _R_BASE_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """What the file says: settings of the bridge, and the map to publish."""
+    """The content of a robot file: settings of the bridge, and the map to publish."""
 
     settings: RobotSettings
     grid: FloorMap = field(default_factory=lambda: free_rectangle(FREE_SQUARE_M))

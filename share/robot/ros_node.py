@@ -190,8 +190,8 @@ def _yaw_quaternion(types: Any, yaw: float) -> Any:
 
 
 def _release(result_data: bytes | None, feedback_data: bytes | None) -> str:
-    """Return the ROS release by what the publishers of results and feedback tell of their types: Humble's say
-    nothing; "" for types that no release has, or before they are found."""
+    """Return the ROS release by the user data of the publishers of results and feedback, which name their
+    types (not in Humble); "" for types of no release, or before the publishers are found."""
     if result_data is None or feedback_data is None:
         return ""
     result, feedback = (_HASH.search(data) for data in (result_data, feedback_data))

@@ -42,9 +42,9 @@ def _rotated(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class RobotSettings:
-    """T_body_base (4, 4): takes coordinates in base_link to the agent's body. allow_goals: whether anything
-    may move. max_sigma_m: a position in the map that is less sure stops the robot. edge_silence_s: so long
-    a goal goes on without the edge. agent: whose poses; None: of the first that comes."""
+    """T_body_base (4, 4): takes coordinates in base_link to the agent's body. allow_goals: whether the robot
+    may move. max_sigma_m: a larger sigma of its position in the map stops the robot. edge_silence_s: longest
+    time that a goal goes on without the edge. agent: source of the poses; None: the first that comes."""
 
     T_body_base: F64 = field(default_factory=lambda: np.eye(4))
     allow_goals: bool = False

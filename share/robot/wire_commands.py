@@ -139,7 +139,7 @@ class WireCommands:
 
     def _make_room(self) -> bool:
         """Forget one of too many commands: the oldest final one, else one that never began, else a
-        cancellation, whose repetition is answered anew. Return whether there is room."""
+        cancellation (a repeated one is answered anew). Return whether there is room."""
         if len(self._known) < _MAX_KNOWN:
             return True
         known = self._known.items()

@@ -1,4 +1,4 @@
-"""`share doctor --acceptance`: track a device while a person goes through the steps, and judge what came.
+"""`share doctor --acceptance`: track a device while a person goes through the steps, and judge the results.
 
 The time is that of the source, so that a recording of the same steps is judged alike.
 """
@@ -36,7 +36,7 @@ _LEAST_ARRIVALS = 100  # for the drift of the device's clock
 
 @dataclass(frozen=True)
 class AcceptanceLine:
-    """What is shown meanwhile."""
+    """The status shown while it runs."""
 
     step: str
     left_s: float
@@ -68,9 +68,9 @@ class _Pause:
 
 
 class AcceptanceRun:
-    """Collects what is measured. tell: is called with a line for the person. show: with the live line.
+    """Collects the measurements. tell: is called with a line for the person. show: with the live line.
 
-    arrived_ns: returns when a live camera's image of a stamp arrived, monotonic; None of a recording.
+    arrived_ns: returns the arrival of a live camera's image by its stamp, monotonic; None for a recording.
     """
 
     def __init__(

@@ -75,7 +75,7 @@ class LiveStatus:
 
 
 @dataclass
-class _Shared:
+class _ThreadState:
     """State shared by the threads."""
 
     inbox: queue.Queue[ev.AgentEvent] = field(default_factory=lambda: queue.Queue(_INBOX_SIZE))
@@ -111,7 +111,7 @@ class AgentRun:
         self._guard = FaultGuard(notify)
         self._state_machine = (StreamingAgent if hello.streams_frames else AgentProtocol)(hello, settings)
         check_trackable(source.name, source.rig)  # before files are made and the edge sees this agent
-        self._shared = _Shared()
+        self._shared = _ThreadState()
         self._files, self._output_writer = AgentFiles(out, notify), OutputWriter(out, notify)
         self._log = RunLog(BackgroundLines(self._files.frame_lines, self._output_writer))
         estimator = NoErrorEstimate() if error_estimator is None else error_estimator

@@ -1,9 +1,9 @@
-"""What an edge says of its policy in a blind study: the letter of the condition, and nothing else.
+"""Hide the policy of an edge in a blind study: it shows the letter of the condition in place of it.
 
-All that an edge tells of itself comes from its report (edge.json, /snapshot.json, /metrics, the pages) and
-from its events (events.jsonl, the terminal, the live room), which are covered here. Its configuration is
-shown as a digest, salted so that no list of guesses finds it. What only some policies have or do is left out
-under all: rates and their targets, loops that a gate leaves out, and that a policy finds the air full.
+An edge describes itself by its report (edge.json, /snapshot.json, /metrics, the pages) and its events
+(events.jsonl, the terminal, the live room); both are covered here. The configuration is shown as a digest,
+salted so that no list of guesses finds it. Fields and events that only some policies have are left out under
+all: rates and their targets, merges that the gate skipped, and refusals for lack of air.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Blinding:
     seal: str
 
     def covered(self, report: dict[str, Any]) -> dict[str, Any]:
-        """Return the report of an edge (edge.json without `series`) without its policy, its configuration and
-        what is bound to a policy, which is None."""
+        """Return the report of an edge (edge.json without `series`) without its policy and configuration.
+        Fields that only some policies have are None."""
         agents = {name: _covered_agent(one) for name, one in report.get("agents", {}).items()}
         lines = [line for line in report.get("refused", ()) if not _REASONS.match(line)]
         merges = _emptied(report["merges"], _GATED) if report.get("merges") else None
@@ -42,7 +42,7 @@ class Blinding:
         )
 
     def covered_event(self, fields: dict[str, Any]) -> dict[str, Any] | None:
-        """Return an event without what only some policies say; None: it is not told."""
+        """Return an event in words that all policies share; None: it is left out."""
         if fields["event"] in _KINDS:
             return None
         return fields | {"reason": _neutral(str(fields.get("reason") or ""))}

@@ -37,7 +37,7 @@ _DISABLE_PPD_COMMAND = (
 
 
 def inspect_device(profile: HostProfile, calib: Path | None, out: Path) -> list[CheckResult]:
-    """Check camera, calibration, computer and port. calib: folder. out: folder whose disk is judged."""
+    """Check camera, calibration, computer and port. calib: folder. out: folder on the disk to check."""
     sdk = _query_sdk(profile)
     return [
         *_inspect_camera(profile, sdk),

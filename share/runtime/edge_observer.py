@@ -1,4 +1,4 @@
-"""Who looks on while an edge runs, such as the live room: is shown what happens, and holds nothing up."""
+"""Observers of a running edge, such as the live room: they see what happens, and delay nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an agent does with its frames: it tracks them, or has the edge track them (policy `streamed`)."""
+"""The two ways of an agent with its frames: track them, or have the edge track them (policy `streamed`)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Supervision of the mapper: its progress, troubles of late, and after its death, when and with which map it
-restarts."""
+"""Supervision of the mapper: its progress, recent troubles, and after its death the time and map of its
+restart."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class MapperRestarts:
 
     @property
     def losses(self) -> list[str]:
-        """What the map lacks or may lack, a line each. A line stays until the edge is restarted without its
-        cause, such as a damaged file that was kept beside the map."""
+        """Certain and possible losses of the map, a line each. A line stays until the edge is restarted
+        without its cause, such as a damaged file that was kept beside the map."""
         lines = list(self._asides)
         if self.store is not None:
             name = self.store.path.name

@@ -98,7 +98,7 @@ class OutputWriter:
 
     @property
     def trouble(self) -> str | None:
-        """What is wrong with the disk now, None if nothing. Safe from any thread."""
+        """The present trouble of the disk; None without one. Safe from any thread."""
         took_s = self._thread.busy_s
         if took_s < _SLOW_WRITE_S:
             return None

@@ -13,7 +13,7 @@ from share.types import F64, TrackState
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where the body of an agent was at a moment. The body is the IMU's frame, cam0's without an IMU.
+    """The pose of an agent's body at a frame. The body is the IMU's frame, cam0's without an IMU.
 
     stamp_ns: of the frame, in the clock of its images. T_odom_body (4, 4): takes coordinates in the body to
     odom: metres, z up; continuous within a segment. T_map_body (4, 4): the same in the shared map `map_id`;

@@ -18,7 +18,7 @@ _WAIT_S, _SHOW_S = 0.01, 0.5
 
 
 class DriveRecorder:
-    """Poses and wheel odometry, with times of the host. agent: whose poses; None: of the first."""
+    """Poses and wheel odometry, with times of the host. agent: source of the poses; None: the first."""
 
     def __init__(self, agent: str | None) -> None:
         self._agent = agent
@@ -40,7 +40,7 @@ class DriveRecorder:
 
     @property
     def text(self) -> str:
-        """What has come so far."""
+        """The samples so far, for a person."""
         way_m = sum(
             np.hypot(b[2] - a[2], b[3] - a[3]) for a, b in zip(self._wheels, self._wheels[1:], strict=False)
         )

@@ -159,7 +159,7 @@ class EdgeFiles:
 
     @property
     def trouble(self) -> str | None:
-        """What is wrong with the disk now, None if nothing."""
+        """The present trouble of the disk; None without one."""
         return None if self._out is None else self._writer.trouble
 
     def write_event(self, fields: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What SIGINT, SIGTERM and SIGHUP do: they unwind a command, so that its children end and its temporary files
+"""SIGINT, SIGTERM and SIGHUP unwind a command, so that its children end and its temporary files
 go, or ask a live run to end by itself.
 """
 

@@ -21,8 +21,8 @@ class StatusServer:
 
     report: returns the edge's report as in edge.json, with current problems as `trouble`, `last_solve_s` and
     `uptime_s` where known. Called from the server's thread; if it fails, the response says so, and `notify`
-    is called once. token: as in `WebServer`. plan: returns /plan.json, as `Plan.report`. Raises UsageError or
-    TransportError like it.
+    is called once. token: as in `WebServer`. plan: returns /plan.json, as `RoomPlan.report`. Raises
+    UsageError or TransportError like it.
     """
 
     def __init__(

@@ -229,7 +229,7 @@ class _HttpConnection:
 
 
 def _parts(request: bytes) -> tuple[str, bytes]:
-    """Return the head of a request, whose lines end by newlines, and its body."""
+    """Return the head of a request, with lines that end by newlines, and its body."""
     end = re.search(rb"\n\r?\n", request)
     head, body = (request, b"") if end is None else (request[: end.start() + 1], request[end.end() :])
     return head.decode("latin-1").replace("\r\n", "\n"), body

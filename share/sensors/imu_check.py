@@ -18,10 +18,10 @@ _MAX_NEIGHBOUR_DISTANCE = _MAX_SPIKE_SAMPLES + _NEIGHBOURS
 _HISTORY_SAMPLES = _MAX_SPIKE_SAMPLES - 1 + _MAX_NEIGHBOUR_DISTANCE
 _MAX_STEP_NS = 25_000_000  # samples further apart than this are not compared
 _REFERENCE_STEP_NS = 5_000_000  # step for which the bounds hold (200 Hz); they grow with the step
-# A spike is a run whose every sample differs from all of its neighbours by more than factor times the spread
-# of the neighbours, plus margin (rad/s, m/s^2). Among 195,000 samples of seven drone and hand-held recordings
-# (EuRoC, TUM-VI), in runs of one, two or three, the excess over factor times the spread was at most 0.13
-# and 4.0 with neighbours on both sides, 0.8 and 13 with neighbours before only.
+# A spike is a run of samples that all differ from all of their neighbours by more than factor times the
+# spread of the neighbours, plus margin (rad/s, m/s^2). Among 195,000 samples of seven drone and hand-held
+# recordings (EuRoC, TUM-VI), in runs of one, two or three, the excess over factor times the spread was at
+# most 0.13 and 4.0 with neighbours on both sides, 0.8 and 13 with neighbours before only.
 _BOUNDS_BETWEEN = (4.0, np.repeat([1.0, 20.0], 3))  # factor, margin: neighbours on both sides
 _BOUNDS_AT_END = (8.0, np.repeat([3.0, 50.0], 3))  # neighbours before only
 

@@ -9,7 +9,14 @@ from pathlib import Path
 from share.errors import ConfigError
 from share.files.yaml_file import Section, read_yaml
 from share.plain_data import MAX_NUMBER, from_mapping
-from share.sensors.profile_types import CameraMode, DeviceFacts, Emulation, HostFacts, InertialFacts, Profile
+from share.sensors.profile_types import (
+    CameraMode,
+    DeviceFacts,
+    EmulatorModel,
+    HostFacts,
+    InertialFacts,
+    Profile,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +26,7 @@ class _ProfileFile:
     name: str
     host: HostFacts
     device: DeviceFacts | None = None
-    emulation: Emulation | None = None
+    emulation: EmulatorModel | None = None
     role: str = ""
 
     def __post_init__(self) -> None:

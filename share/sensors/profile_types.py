@@ -235,7 +235,7 @@ class DepthModel:
 
 
 @dataclass(frozen=True)
-class Emulation:
+class EmulatorModel:
     """Properties that data sheets do not state, as the emulator assumes them."""
 
     camera: CameraModel
@@ -250,7 +250,7 @@ class Profile:
     name: str
     device: DeviceFacts
     host: HostFacts
-    emulation: Emulation
+    emulation: EmulatorModel
     mode: CameraMode
     rate_hz: float
 

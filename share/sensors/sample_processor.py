@@ -46,7 +46,7 @@ class SampleProcessor:
     """Repairs stamps, joins accel and gyro, counts losses. Pure: no clock but the samples' own.
 
     After a reconnection, or when the device's clock restarts without one (`restarts`), a new segment begins,
-    and time advances by as much as the host's clock did. `host_stamped` counts samples whose stamps are of
+    and time advances by as much as the host's clock did. `host_stamped` counts samples with stamps of
     the host's clock: they are used, but reported. `streams` has a `GapCounter` for each stream.
 
     One repair never mixes the two clocks. Among device-stamped samples, a host-stamped one is placed by its

@@ -28,7 +28,7 @@ _STALL_FACTOR = 10  # a stream that lets images wait for this many times a frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UndecodedFrame:
-    """A `Frame` whose images are not decoded yet. index: counts this iterator's frames from 0."""
+    """A `Frame` with images that are not decoded yet. index: counts this iterator's frames from 0."""
 
     stamp_ns: int
     index: int

@@ -143,7 +143,7 @@ _MIN_RESTART_NS = 250_000_000  # of past stamps only; bursts of late or repeated
 
 
 class ClockRestartDetector:
-    """Detects that a device's clock restarted unannounced: past stamps only, in order, for a while.
+    """Detects an unannounced restart of a device's clock: past stamps only, in order, for a while.
 
     Call `accept` or `reject` for every sample. Pure: no clock but the samples' own.
     """

@@ -12,7 +12,7 @@ _MAX_FAILED_CONNECTIONS = 2  # connections after a reset without a needed stream
 
 
 class Action(Enum):
-    """What the watchdog asks its caller to do."""
+    """A request of the watchdog to its caller."""
 
     NOTHING = "nothing"
     RESET = "reset"  # reset the hardware, once per run; then reconnect

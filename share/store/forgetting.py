@@ -18,8 +18,8 @@ from share.store.map_store import MapStore
 
 @dataclass(frozen=True)
 class ForgettingReport:
-    """What is deleted and what stays. agents: keyframes by name; maps: keyframes by map; earlier_maps: number
-    of maps before. image_bytes: of the deleted images. copies: other files that still hold all of it."""
+    """Counts of deleted and remaining items. agents: keyframes by name; maps: keyframes by map; earlier_maps:
+    number of maps before. image_bytes: of the deleted images. copies: other files that still hold it all."""
 
     deleted_keyframes: int
     deleted_agents: dict[str, int]

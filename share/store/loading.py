@@ -39,7 +39,7 @@ _SOLUTIONS_LOST = "solutions could not be read: keyframes are placed by odometry
 
 @dataclass(frozen=True, eq=False)
 class OpenedMap:
-    """A map file as it was read: its rows, without images and views, and what is missing, a line each."""
+    """The content of a map file: its rows, without images and views, and its losses, a line each."""
 
     rows: ReadRows
     problems: tuple[str, ...] = ()
@@ -59,7 +59,7 @@ def read_and_repair(path: Path) -> OpenedMap:
 
 
 def damage_text(renamed: Path) -> str:
-    """What happened to a damaged file, which has another name now."""
+    """The fate of a damaged file, which has another name now."""
     return f"the file was damaged; it is kept as {renamed.name}, and its intact rows were taken over"
 
 
@@ -144,10 +144,10 @@ def _with_problem(loaded: StoredMap, complaint: str) -> StoredMap:
 
 
 def outline_map(read_rows: ReadRows) -> StoredMap:
-    """Decode what the runs continue from: of the keyframes the newest of each run, and those without a pose.
+    """Decode the part that runs continue from: the newest keyframe of each run, and those without a pose.
 
-    Decoding all keyframes takes seconds for 20,000. Where a row cannot be decoded, all are, so that
-    `problems` says what is lost. Raises StoreError for another wire version.
+    Decoding all keyframes takes seconds for 20,000. If a row cannot be decoded, all rows are, so that
+    `problems` lists the losses. Raises StoreError for another wire version.
     """
     try:
         return _outline(read_rows)
@@ -275,7 +275,7 @@ def _present_poses(poses: SavePoses, known_keys: set[KeyframeKey]) -> SavePoses:
     )
 
 
-# ---- Repair of keyframes whose reference is missing
+# ---- Repair of keyframes without their reference
 
 
 @dataclass(frozen=True, eq=False)

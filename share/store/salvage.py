@@ -159,8 +159,7 @@ _MIN_ROW_BYTES = 32  # smallest row, which bounds the number of rows by the file
 
 @dataclass
 class ReadRows:
-    """Intact rows by table, with their numbers; counts of lost rows; tables whose losses cannot be
-    counted."""
+    """Intact rows by table, with their numbers; counts of lost rows; tables with uncountable losses."""
 
     tables: dict[str, list[tuple[int, Row]]] = field(default_factory=dict)
     lost_counts: Counter[str] = field(default_factory=Counter)

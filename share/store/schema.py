@@ -40,7 +40,7 @@ _ADDED = {  # by schema; last in the file, so that page 1 of an older file diffe
     " UNIQUE(run, id))",
 }
 ADDED_TABLES = ("arrival", "image", "view")  # which an older file lacks
-LARGE_TABLES = ("image", "view")  # whose rows are read when they are needed, not when the file is opened
+LARGE_TABLES = ("image", "view")  # rows are read when needed, not when the file is opened
 SMALL_TABLES = tuple(table for table in COLUMNS if table not in LARGE_TABLES)
 
 

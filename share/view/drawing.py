@@ -45,7 +45,7 @@ class Marks:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class AgentBody:
     """An agent: T_room_body (4, 4). half_angles: as in `RunArrived`. is_current: its pose is current."""
 
     name: str
@@ -60,7 +60,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Picture:
-    """What the agent `name` saw at its newest keyframe, a JPEG."""
+    """The picture of the newest keyframe of agent `name`, a JPEG."""
 
     name: str
     jpeg: bytes
@@ -85,7 +85,7 @@ class FloorGrid:
 
 
 @dataclass(frozen=True)
-class Removed:
+class RemoveDrawing:
     """Remove the object of this name."""
 
     name: str
@@ -102,7 +102,7 @@ class Announcement:
     text: str
 
 
-Drawing = Points | Lines | Marks | Body | Picture | Text | FloorGrid | Removed | Announcement
+Drawing = Points | Lines | Marks | AgentBody | Picture | Text | FloorGrid | RemoveDrawing | Announcement
 
 
 _FRUSTUM_M = 0.12  # size of a keyframe

@@ -17,7 +17,7 @@ REFUSALS = frozenset(("merge skipped", "loop refused", "loop not accepted"))
 
 @dataclass(frozen=True)
 class SessionBegun:
-    """The map starts anew. map_file: what it continues with; None: nothing."""
+    """The map starts anew. map_file: the map that it continues; None: none."""
 
     map_file: Path | None = None
 
@@ -142,11 +142,10 @@ RoomEvent = (
 MAX_KEYFRAMES = 5000  # some kB each
 
 
-class Recap:
-    """Follows the events of a session, to tell a live room that starts again what is there.
+class SessionSnapshot:
+    """The state of a session as the fewest events that lead to it, for a live room that is started again.
 
-    Without how it came to be: pictures are left out, and all but the newest keyframes; with a map file, the
-    room reads the older ones there.
+    It has no pictures, and the newest keyframes only; with a map file the live room reads older ones there.
     """
 
     def __init__(self) -> None:

@@ -25,7 +25,7 @@ from share.protocol.peer import RestoredRun
 from share.types import Keyframe
 from share.view import events as ev
 from share.view import sources
-from share.view.events import Recap
+from share.view.events import SessionSnapshot
 from share.wire.messages import Hello, PoseUpdate
 
 MAX_QUEUED = 512  # with keyframes of 30 kB, 15 MB
@@ -62,7 +62,7 @@ class ViewFeed:
         self._connection = connection
         self._collect_s, self._has_images = collect_s, has_images
         self._next_connection: Connection | None = None
-        self._recap = Recap()
+        self._snapshot = SessionSnapshot()
         self._queue: deque[object] = deque(maxlen=MAX_QUEUED)
         # the newest of each run or agent, not queued
         self._poses: Mapping[str, _SeenPose] = {}
@@ -131,7 +131,7 @@ class ViewFeed:
         self._add(event)
 
     def reconnect(self, connection: Connection) -> None:
-        """Continue with another process, which first receives a recap."""
+        """Continue with another process, which first receives a snapshot."""
         self._next_connection = connection
 
     def close(self, wait_s: float = 1.0) -> None:
@@ -152,11 +152,11 @@ class ViewFeed:
             if (connection := self._next_connection) is not None:
                 self._connection, self._next_connection = connection, None
                 self._sent_stamps.clear()
-                for events in batched(self._recap.events()):
+                for events in batched(self._snapshot.events()):
                     self._send(events)
             for events in batched(self._take_events()):
                 for event in events:
-                    self._recap.apply(event)
+                    self._snapshot.apply(event)
                 self._send(events)
         self._send(END)
 

@@ -1,5 +1,5 @@
-"""Loops in the live room: their lines, in chunks that are drawn together; what the two keyframes of a loop
-saw, as small pictures of the newest keyframes; and which loop is meant by a click."""
+"""Loops in the live room: their lines, in chunks that are drawn together; small pictures of the newest
+keyframes, to show those of a loop; and the loop nearest to a click."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A process that serves a page to browsers, started and watched by the process whose page it is.
+"""A process that serves a page to browsers, started and watched by the process that the page is about.
 
 It ends with the process that started it, which it can neither hold up nor end. That one starts it again if it
 ends by itself, and ends it if its heartbeat stops or it grows too large.

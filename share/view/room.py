@@ -8,7 +8,7 @@ often it changed since the last time, and only so many at a time: a viewer is ne
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -23,16 +23,16 @@ from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
 from share.view.drawing import frusta, lines, named, shifted
+from share.view.floor import Floor
 from share.view.loop_views import KeyframePictures, LoopLines, LoopViews, Pair, nearest_to_ray
-from share.view.map_places import MapPlaces
+from share.view.map_arrangement import MapArrangement
+from share.view.pending_drawings import PendingDrawings
 
 _LOOP_COLOUR, _FLASH_COLOUR, _CORRECTION_COLOUR = (170, 110, 255), (255, 70, 220), (255, 60, 60)
 _MAX_CHUNKS = 12  # drawn at a time
 _MAX_ANNOUNCEMENTS = 3  # in `ANNOUNCED_S`; the panel counts the others
 _FLASH_S, _TEXT_S = 1.5, 8.0  # s, for which a new loop or correction, and a merge, are highlighted
 _LEAST_CORRECTION_M = 0.005  # m; smaller corrections are not drawn
-_FLOOR_STEP_M = 0.3  # a lower floor is not drawn again for less
-_FLOOR_MARGIN_M, _MOST_SPARE_M = 1.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class DrawnRoom:
     """All runs, their keyframes and loops. Times are the viewer's, s."""
 
     def __init__(self) -> None:
-        self._drawn: set[str] = set()
+        self._pending = PendingDrawings()
         self._next_number = 0
         self._begin()
 
@@ -56,15 +56,12 @@ class DrawnRoom:
         self.runs: dict[str, RunPath] = {}
         self.corrections: dict[str, LastCorrection] = {}  # by run
         self._loops, self._views = LoopLines(), KeyframePictures()
-        self._places = MapPlaces()
+        self._arrangement = MapArrangement()
         self._colour_numbers: dict[str, int] = {}  # by name of agent
-        # how to draw what has changed, by name
-        self._dirty: dict[str, Callable[[], list[dr.Drawing]]] = dict.fromkeys(self._drawn, _nothing)
-        self._temporary: dict[str, float] = {}  # until when things are shown, by name
+        self._pending.remove_all()
         self._moved_runs: set[str] = set()
         self._pictures: dict[str, bytes] = {}
-        self._lows: dict[str, F64] = {}  # corner and floor of each chunk of keyframes: x, y, z, x, y
-        self._floor: dr.FloorGrid | None = None
+        self._floor = Floor()
         self._announcements: list[dr.Announcement] = []
         self._announced_s: deque[float] = deque(maxlen=_MAX_ANNOUNCEMENTS)
 
@@ -139,10 +136,9 @@ class DrawnRoom:
         moved_m = float(np.linalg.norm(after[1][:3, 3] - before[1][:3, 3]))
         self.corrections[event.run] = LastCorrection(now_s, moved_m)
         if moved_m >= _LEAST_CORRECTION_M:
-            ends = np.array([[before[1][:3, 3], after[1][:3, 3]]]) + self._places.offset(after[0])
-            self._show_for(
-                f"/corrections/{run.number}", lines(ends, _CORRECTION_COLOUR, 5.0), now_s, _FLASH_S
-            )
+            ends = np.array([[before[1][:3, 3], after[1][:3, 3]]]) + self._arrangement.offset(after[0])
+            drawing = lines(ends, _CORRECTION_COLOUR, 5.0)
+            self._pending.show_until(f"/corrections/{run.number}", drawing, now_s + _FLASH_S)
 
     def _solve(self, event: ev.MapsSolved) -> None:
         poses = event.poses
@@ -160,9 +156,8 @@ class DrawnRoom:
                 one.loop_chunks.add(chunk)
         self._mark_loops({chunk})
         if (ends := self._loop_ends([(a, b)])) is not None:
-            self._show_for(
-                f"/loops/new/{self._loops.count}", lines(ends, _FLASH_COLOUR, 6.0), now_s, _FLASH_S
-            )
+            drawing = lines(ends, _FLASH_COLOUR, 6.0)
+            self._pending.show_until(f"/loops/new/{self._loops.count}", drawing, now_s + _FLASH_S)
 
     def _remove_keyframe(self, key: KeyframeKey) -> None:
         if (run := self.runs.get(key.agent)) is not None and (one := run.remove_keyframe(key.id)) is not None:
@@ -171,7 +166,7 @@ class DrawnRoom:
     def _forget(self, key: KeyframeKey, one: PlacedKeyframe) -> None:
         """Forget all but the run's own knowledge of a keyframe that is removed."""
         self._mark(key.agent, one)
-        self._places.put(key, None)
+        self._arrangement.put(key, None)
         self._mark_loops(self._loops.remove_keyframe(key))
         self._views.remove(key)
 
@@ -179,11 +174,11 @@ class DrawnRoom:
         if (run := self.runs.get(name)) is None:
             return
         for chunk in run.path_chunks:
-            self._dirty[f"/paths/{run.number}/{chunk}"] = _nothing
+            self._pending.remove(f"/paths/{run.number}/{chunk}")
         for one in run.keyframes.values():
             self._forget(KeyframeKey(name, one.id), one)
         run.remove_all()
-        self._dirty[f"/agents/{run.number}"] = _nothing
+        self._pending.remove(f"/agents/{run.number}")
         del self.runs[name]
         self.corrections.pop(name, None)
         self._arrange_maps()
@@ -204,8 +199,8 @@ class DrawnRoom:
             self._announcements.append(dr.Announcement(title, event.reason))
         for run in reversed(self.runs.values()):
             if run.shown.name == event.agent and (place := run.place()) is not None:
-                position = place[1][:3, 3] + self._places.offset(place[0]) + (0.0, 0.0, 0.5)
-                self._show_for("/texts/merge", dr.Text("", title, position), now_s, _TEXT_S)
+                position = place[1][:3, 3] + self._arrangement.offset(place[0]) + (0.0, 0.0, 0.5)
+                self._pending.show_until("/texts/merge", dr.Text("", title, position), now_s + _TEXT_S)
                 return
 
     # ------------------------------------------------------------------ what has changed
@@ -213,10 +208,10 @@ class DrawnRoom:
     def _mark(self, run_key: str, one: PlacedKeyframe) -> None:
         """Mark all that is drawn with a keyframe, which has another place."""
         run = self.runs[run_key]
-        self._places.put(KeyframeKey(run_key, one.id), one.map_id or None)
+        self._arrangement.put(KeyframeKey(run_key, one.id), one.map_id or None)
         for kind in ("points", "keyframes"):
             name = f"/{kind}/{run.number}/{one.chunk}"
-            self._dirty[name] = partial(self._draw_keyframes, run, one.chunk, kind, name)
+            self._pending.put(name, partial(self._draw_keyframes, run, one.chunk, kind, name))
         for chunk in one.path_chunks:
             self._mark_path(run_key, chunk)
         self._mark_loops(one.loop_chunks)
@@ -224,23 +219,17 @@ class DrawnRoom:
     def _mark_path(self, run_key: str, chunk: int) -> None:
         run = self.runs[run_key]
         name = f"/paths/{run.number}/{chunk}"
-        self._dirty[name] = partial(self._draw_path, run, chunk, name)
+        self._pending.put(name, partial(self._draw_path, run, chunk, name))
 
     def _mark_loops(self, chunks: Iterable[int]) -> None:
         for chunk in chunks:
             for kind, draw in (("loops", self._draw_loops), ("loop-marks", self._draw_loop_marks)):
                 name = f"/{kind}/{chunk}"
-                self._dirty[name] = partial(draw, chunk, name)
-
-    def _show_for(self, name: str, thing: dr.Lines | dr.Text, now_s: float, duration_s: float) -> None:
-        """Show something for a while."""
-        self._temporary[name] = now_s + duration_s
-        shown: list[dr.Drawing] = [named(thing, name)]
-        self._dirty[name] = lambda: shown
+                self._pending.put(name, partial(draw, chunk, name))
 
     def _arrange_maps(self) -> None:
         """Let maps move up to where one is gone."""
-        for key in self._places.close_gaps():
+        for key in self._arrangement.close_gaps():
             if (one := self._keyframe(key)) is not None:
                 self._mark(key.agent, one)
                 self._moved_runs.add(key.agent)
@@ -251,68 +240,58 @@ class DrawnRoom:
         """Return what has changed since the last call."""
         out: list[dr.Drawing] = [*self._announcements]
         self._announcements = []
-        self._end_temporary(now_s)
+        self._pending.expire(now_s)
         for key in sorted(self._moved_runs):
             if (run := self.runs.get(key)) is not None and (body := self._draw_body(run)):
                 out.append(body)
                 if key in self._pictures:
                     out.append(dr.Picture(body.name, self._pictures.pop(key)))
         self._moved_runs.clear()
-        for name in list(self._dirty)[:_MAX_CHUNKS]:
-            things = self._dirty.pop(name)()
-            out += things
-            if things:
-                self._drawn.add(name)
-            elif name in self._drawn:
-                self._drawn.remove(name)
-                out.append(dr.Removed(name))
-        if (floor := self._new_floor()) is not None:
+        out += self._pending.take(_MAX_CHUNKS)
+        if (floor := self._floor.take_change()) is not None:
             out.append(floor)
         return out
 
     def forget_moments(self, now_s: float) -> None:
         """Forget what is shown only for a while, where nobody looks: what is left to draw stays bounded."""
         self._announcements = []
-        self._end_temporary(now_s)
-
-    def _end_temporary(self, now_s: float) -> None:
-        for name in [name for name, until_s in self._temporary.items() if now_s >= until_s]:
-            del self._temporary[name]
-            if name in self._drawn:
-                self._dirty[name] = _nothing
-            else:
-                self._dirty.pop(name, None)
+        self._pending.expire(now_s)
 
     @property
     def waiting(self) -> int:
         """Number of things that have changed and are not drawn yet."""
-        return len(self._dirty)
+        return len(self._pending)
+
+    @property
+    def has_shown(self) -> bool:
+        """Whether a viewer was given a drawing that was not removed since."""
+        return self._pending.has_shown
 
     def agent_place(self, run_key: str) -> F64 | None:
         """Return T_room_body (4, 4) of a run; None if unknown."""
         place = None if (run := self.runs.get(run_key)) is None else run.place()
-        return None if place is None else shifted(place[1], self._places.offset(place[0]))
+        return None if place is None else shifted(place[1], self._arrangement.offset(place[0]))
 
     def colour(self, run: RunPath) -> Colour:
         """Return the colour of an agent, by the order in which they came."""
         return agent_colour(self._colour_numbers[run.shown.name])
 
-    def _draw_body(self, run: RunPath) -> dr.Body | None:
+    def _draw_body(self, run: RunPath) -> dr.AgentBody | None:
         if (place := run.place()) is None:
             return None
         shown = run.shown
-        T = shifted(place[1], self._places.offset(place[0]))
+        T = shifted(place[1], self._arrangement.offset(place[0]))
         is_current = run.state.has_pose and run.is_current
         name, colour = f"/agents/{run.number}", self.colour(run)
-        self._drawn.add(name)
-        return dr.Body(
+        self._pending.add_shown(name)
+        return dr.AgentBody(
             name, shown.name, shown.kind, T, shown.T_body_cam0, shown.half_angles, colour, is_current
         )
 
     def _draw_keyframes(self, run: RunPath, chunk: int, kind: str, name: str) -> list[dr.Drawing]:
         placed = [(one, T) for one in run.chunks[chunk] if (T := self._T_room(one)) is not None]
-        self._lows.pop(name, None)
         if not placed:
+            self._floor.set_points(name, np.empty((0, 3)))
             return []
         T = np.array([T for _, T in placed])
         origin = T[:, :3, 3].mean(axis=0)
@@ -322,17 +301,16 @@ class DrawnRoom:
         points = np.concatenate(
             [one.points @ R.T + t for (one, _), R, t in zip(placed, T[:, :3, :3], T[:, :3, 3], strict=True)]
         )
-        if not len(points):
-            return []
-        low, high = np.percentile(points, [2, 98], axis=0) + origin
-        self._lows[name] = np.concatenate([low, high[:2]])
-        return [dr.Points(name, origin, points.astype(np.float32), self.colour(run))]
+        self._floor.set_points(name, points + origin)
+        return (
+            [] if not len(points) else [dr.Points(name, origin, points.astype(np.float32), self.colour(run))]
+        )
 
     def _draw_path(self, run: RunPath, chunk: int, name: str) -> list[dr.Drawing]:
         placed = run.path(chunk)
         if len(placed) < 2:
             return []
-        points = np.array([position + self._places.offset(map_id) for map_id, position in placed])
+        points = np.array([position + self._arrangement.offset(map_id) for map_id, position in placed])
         same_map = np.array([a[0] == b[0] for a, b in pairwise(placed)])
         segments = np.stack([points[:-1], points[1:]], axis=1)[same_map]
         return [named(lines(segments, self.colour(run), 3.0), name)] if len(segments) else []
@@ -369,33 +347,11 @@ class DrawnRoom:
         """Return the pose (4, 4) of a keyframe in the room; None if unknown."""
         if one is None or one.T_map_body is None:
             return None
-        return shifted(one.T_map_body, self._places.offset(one.map_id))
+        return shifted(one.T_map_body, self._arrangement.offset(one.map_id))
 
     def _keyframe(self, key: KeyframeKey) -> PlacedKeyframe | None:
         return None if (run := self.runs.get(key.agent)) is None else run.keyframes.get(key.id)
 
-    def _new_floor(self) -> dr.FloorGrid | None:
-        """Return the floor where it has to be drawn again: below the lowest points, about as wide as the
-        maps."""
-        if not self._lows:
-            return None
-        corners = np.array(list(self._lows.values()))
-        z = float(np.percentile(corners[:, 2], 10))
-        low, high = corners[:, :2].min(axis=0) - _FLOOR_MARGIN_M, corners[:, 3:].max(axis=0) + _FLOOR_MARGIN_M
-        old = self._floor
-        if old is not None and abs(z - old.z) < _FLOOR_STEP_M:
-            spare = np.concatenate([low - old.low, old.high - high])  # on each side
-            if (spare >= 0).all() and (spare < _MOST_SPARE_M).all():
-                return None
-        margin = 0.0 if old is None else 1.5  # it grows by steps
-        low, high = np.floor(low - margin), np.ceil(high + margin)
-        self._floor = dr.FloorGrid(z, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
-        return self._floor
-
     @property
     def floor(self) -> dr.FloorGrid | None:
-        return self._floor
-
-
-def _nothing() -> list[dr.Drawing]:
-    return []
+        return self._floor.grid

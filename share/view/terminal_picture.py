@@ -65,8 +65,8 @@ class TerminalPicture:
     # ------------------------------------------------------------------ a line for each agent
 
     def _agent_lines(self, agents: Report, columns: int, rows: int) -> list[str]:
-        """Return a line for each agent and one for what is wrong with it; of more than fit, who is in trouble
-        first, and how many are left out."""
+        """Return a line for each agent and one for its trouble; if not all fit, agents in trouble first, and
+        the number left out."""
         names = sorted(agents, key=natural_order)
         width = min(_MAX_NAME, max([10, *map(len, names)]))
         troubled = [name for name in names if agents[name].get("trouble")]

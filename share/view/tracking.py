@@ -1,4 +1,4 @@
-"""What `share track --view` shows: one agent, in the frame of its odometry."""
+"""The live room of `share track --view`: one agent, in the frame of its odometry."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class Window:
                 )
             case dr.Marks():
                 self._draw_marks(one)
-            case dr.Body():
+            case dr.AgentBody():
                 self._draw_body(one)
             case dr.Picture():
                 self._draw_picture(one)
@@ -151,7 +151,7 @@ class Window:
                 scene.add_label(one.name, one.text, position=one.position, font_screen_scale=1.3)
             case dr.FloorGrid():
                 self._draw_floor(one)
-            case dr.Removed():
+            case dr.RemoveDrawing():
                 self._frames.pop(one.name, None)
                 self._colours.pop(one.name, None)
                 self._server.scene.remove_by_name(one.name)
@@ -195,7 +195,7 @@ class Window:
             client.gui.add_html(views.html())
             client.gui.add_button("close").on_click(close)
 
-    def _draw_body(self, body: dr.Body) -> None:
+    def _draw_body(self, body: dr.AgentBody) -> None:
         colour = body.colour if body.is_current else _GREY
         if self._colours.get(body.name) != (colour, body.label):
             self._make_body(body, colour)
@@ -206,7 +206,7 @@ class Window:
         )
         camera.position, camera.wxyz = body.T_room_body[:3, 3], _wxyz(body.T_room_body[:3, :3])
 
-    def _make_body(self, body: dr.Body, colour: Colour) -> None:
+    def _make_body(self, body: dr.AgentBody, colour: Colour) -> None:
         scene, name = self._server.scene, body.name
         self._colours[name] = colour, body.label
         scene.add_frame(name, show_axes=False)

@@ -22,14 +22,14 @@ _MAX_NUMBER = 2**62  # of commands and requests
 
 
 class ObjectKind(StrEnum):
-    """What an object is shown as."""
+    """How an object is drawn."""
 
     CUBE = "cube"
     MARKER = "marker"
 
 
 class Permission(StrEnum):
-    """What a client may do beside looking on: send robots; place, move and remove objects."""
+    """Rights of a client beyond seeing the room: send robots; place, move and remove objects."""
 
     COMMANDS = "commands"
     OBJECTS = "objects"
@@ -192,7 +192,7 @@ class Cancel:
 
 @dataclass(frozen=True)
 class CommandState:
-    """What becomes of a command, from the robot's bridge, or from an edge that does not pass it on.
+    """Progress of a command, from the robot's bridge, or from an edge that does not forward it.
 
     robot: filled in by the edge. is_final: nothing follows. is_reached: it was done.
     """

@@ -20,7 +20,7 @@ from share.protocol.peer import RestoredRun
 from share.runtime import mapper_process, served_room
 from share.runtime.edge import EdgeRun
 from share.runtime.edge_observer import EdgeObserver
-from share.runtime.plan import Plan
+from share.runtime.room_plan import RoomPlan
 from share.types import TrackState
 from share.wire.messages import PoseUpdate
 
@@ -59,7 +59,7 @@ def test_observers_see_runs_keyframes_decisions_corrections_poses_and_reports(
     link: Any = Link([(11, hello_of("ann", 11)), *((11, k) for k in town.keyframes("ann")), (11, pose)])
     for module in (served_room, mapper_process):
         monkeypatch.setattr(module, "WorkerProcess", Thread)
-    seen, plan = Recorder(), Plan()
+    seen, plan = Recorder(), RoomPlan()
     run = EdgeRun(Config(), link, None, lambda fields: None, observers=[seen, plan])
     thread = threading.Thread(target=run.run)
     thread.start()

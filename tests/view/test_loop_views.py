@@ -78,7 +78,7 @@ def test_loops_have_marks_to_click_until_they_are_removed(room: DrawnRoom) -> No
     (marks,) = [one for one in room.take_drawings(0.0) if isinstance(one, dr.Marks)]
     assert np.allclose(marks.positions[:, 0], [4.25])
     room.apply(ev.LoopsRemoved(KeyframeKey("ann-1", 1), KeyframeKey("bob-1", 1)), 0.0)
-    assert dr.Removed(marks.name) in room.take_drawings(0.0)
+    assert dr.RemoveDrawing(marks.name) in room.take_drawings(0.0)
 
 
 def test_a_picture_that_is_gone_is_said_to_be(room: DrawnRoom) -> None:

@@ -13,7 +13,7 @@ from share.types import F64, AgentKind, TrackState
 from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import KEYFRAMES_PER_CHUNK, PATH_POINTS_PER_CHUNK
-from share.view.map_places import MapPlaces
+from share.view.map_arrangement import MapArrangement
 from share.view.room import DrawnRoom
 
 POINTS = np.random.default_rng(1).uniform(1, 3, (20, 3)).astype(np.float32)
@@ -135,7 +135,7 @@ def test_an_agent_is_where_its_newest_pose_is() -> None:
     room = DrawnRoom()
     told(room, *one_agent(), keyframe("ann", 1, 1.0))
     (body,) = of(told(room, pose("ann", 1, 0.5)), "/agents")
-    assert isinstance(body, dr.Body) and body.is_current and body.label == "ann"
+    assert isinstance(body, dr.AgentBody) and body.is_current and body.label == "ann"
     np.testing.assert_allclose(body.T_room_body, at(1.5))
     assert of(told(room), "/agents") == []
     (body,) = of(told(room, corrected("ann", "A", at(0.0)), pose("ann", -1, 4.0)), "/agents")
@@ -147,7 +147,7 @@ def test_an_agent_that_is_not_heard_is_shown_so(entry: dict[str, object]) -> Non
     room = DrawnRoom()
     told(room, *one_agent(), pose("ann", 0, 0.5))
     (body,) = of(told(room, ev.AgentsReported({"ann": {"run": "ann-1", **entry}})), "/agents")
-    assert isinstance(body, dr.Body) and not body.is_current
+    assert isinstance(body, dr.AgentBody) and not body.is_current
 
 
 def test_its_newest_picture_is_shown_once() -> None:
@@ -203,14 +203,14 @@ def test_a_second_map_within_a_chunk_takes_no_place_away() -> None:
     told(room, pose("bob", 1, 0.0))
     (points,) = of(told(room, corrected("ann", "A", at(0.0, 1.0))), "/points")  # only ann's moves
     assert isinstance(points, dr.Points) and points.name.startswith("/points/0/")
-    offsets = [room._places.offset(one)[:2].tolist() for one in ("A", "B", "B2")]
+    offsets = [room._arrangement.offset(one)[:2].tolist() for one in ("A", "B", "B2")]
     assert offsets == [[0.0, 0.0], [0.0, 10.0], [10.0, 10.0]]
     place = room.agent_place("bob-1")
     assert place is not None and place[:2, 3].tolist() == [11.0, 10.0]
 
 
 def test_many_maps_stand_in_a_square_each_at_a_place_of_its_own() -> None:
-    places = MapPlaces()
+    places = MapArrangement()
     for k in range(30):
         places.put(KeyframeKey("ann-1", k), f"map {k}")
     offsets = np.array([places.offset(f"map {k}")[:2] for k in range(30)])
@@ -221,7 +221,7 @@ def test_many_maps_stand_in_a_square_each_at_a_place_of_its_own() -> None:
 def test_a_map_without_a_keyframe_gives_its_place_up() -> None:
     room = two_maps()
     drawings = told(room, ev.KeyframesRemoved((KeyframeKey("ann-1", 0),)))
-    assert [room._places.offset(one)[1] for one in ("B",)] == [0.0]
+    assert [room._arrangement.offset(one)[1] for one in ("B",)] == [0.0]
     assert any(isinstance(one, dr.Points) and one.name == "/points/1/0" for one in drawings)
 
 
@@ -246,7 +246,7 @@ def test_an_event_of_a_long_session_costs_no_more(soon: None) -> None:
         room.apply(ev.RunRemoved(f"a{k}-1"), 0.0)
     while room.waiting:
         room.take_drawings(1e4)
-    assert not room._drawn
+    assert not room.has_shown
 
 
 def test_maps_that_are_not_joined_stand_beside_each_other() -> None:
@@ -272,7 +272,7 @@ def test_a_merge_moves_one_map_into_the_other_and_is_announced() -> None:
     assert any(isinstance(one, dr.Announcement) and one.text == "B into A by 3 loops" for one in drawings)
     (text,) = of(drawings, "/texts")
     assert isinstance(text, dr.Text) and text.text == "maps merged: bob"
-    assert dr.Removed("/texts/merge") in told(room, now_s=20.0)
+    assert dr.RemoveDrawing("/texts/merge") in told(room, now_s=20.0)
 
 
 def floors(drawings: Iterable[dr.Drawing]) -> list[dr.FloorGrid]:
@@ -316,7 +316,7 @@ def test_a_loop_flashes_and_stays() -> None:
     drawings = told(room, ev.LoopAccepted(a, b), now_s=1.0)
     assert len(of(drawings, "/loops/0")) == 1 and len(of(drawings, "/loops/new")) == 1
     assert names(told(room, now_s=3.0)) == {"/loops/new/1"}
-    assert isinstance(of(told(room, ev.LoopsRemoved(b, a), now_s=3.0), "/loops/0")[0], dr.Removed)
+    assert isinstance(of(told(room, ev.LoopsRemoved(b, a), now_s=3.0), "/loops/0")[0], dr.RemoveDrawing)
 
 
 def test_loops_follow_their_keyframes_and_go_with_them() -> None:
@@ -325,7 +325,7 @@ def test_loops_follow_their_keyframes_and_go_with_them() -> None:
     (lines,) = of(told(room, solved(("bob", 0, "A", at(1.0)))), "/loops/0")
     np.testing.assert_allclose(np.abs(positions(lines)[0, 0] - positions(lines)[0, 1]), [1, 0, 0], atol=1e-6)
     (gone,) = of(told(room, ev.KeyframesRemoved((KeyframeKey("ann-1", 0),))), "/loops/0")
-    assert isinstance(gone, dr.Removed)
+    assert isinstance(gone, dr.RemoveDrawing)
 
 
 def test_a_correction_is_marked_where_it_is_seen() -> None:
@@ -335,7 +335,7 @@ def test_a_correction_is_marked_where_it_is_seen() -> None:
     (mark,) = of(told(room, corrected("ann", "A", at(0.5)), now_s=2.0), "/corrections")
     np.testing.assert_allclose(positions(mark)[0], [[1.001, 0, 0], [1.5, 0, 0]], atol=1e-6)
     assert room.corrections["ann-1"].moved_m == pytest.approx(0.499)
-    assert of(told(room, now_s=9.0), "/corrections") == [dr.Removed(mark.name)]  # type: ignore[union-attr]
+    assert of(told(room, now_s=9.0), "/corrections") == [dr.RemoveDrawing(mark.name)]  # type: ignore[union-attr]
 
 
 # ---------------------------------------------------------------- beginnings and ends
@@ -346,7 +346,7 @@ def test_a_new_session_removes_what_was_drawn() -> None:
     told(room, *one_agent(), keyframe("ann", 1, 1.0), pose("ann", 1, 0.0), pose("ann", 1, 1.0))
     told(room)
     gone = told(room, ev.SessionBegun())
-    assert {one.name for one in gone if isinstance(one, dr.Removed)} >= {
+    assert {one.name for one in gone if isinstance(one, dr.RemoveDrawing)} >= {
         "/points/0/0",
         "/agents/0",
         "/paths/0/0",
@@ -359,7 +359,7 @@ def test_a_forgotten_run_is_removed() -> None:
     room = two_maps()
     told(room)
     gone = told(room, ev.RunRemoved("bob-1"))
-    assert {one.name for one in gone if isinstance(one, dr.Removed)} >= {"/points/1/0", "/agents/1"}
+    assert {one.name for one in gone if isinstance(one, dr.RemoveDrawing)} >= {"/points/1/0", "/agents/1"}
 
 
 @pytest.mark.parametrize(

@@ -332,7 +332,7 @@ def test_what_browsers_are_sent_is_queued_in_one_thread(monkeypatch: pytest.Monk
                 [
                     dr.FloorGrid(0.0, (0.0, 0.0), (1.0, 1.0)),
                     dr.Marks("/marks", np.zeros((2, 3)), (1, 2, 3)),
-                    dr.Body("/agents/0", "ann", AgentKind.AR, box, box, (0.8, 0.6), (1, 2, 3), True),
+                    dr.AgentBody("/agents/0", "ann", AgentKind.AR, box, box, (0.8, 0.6), (1, 2, 3), True),
                     dr.Announcement("maps merged", "x"),
                 ]
             )

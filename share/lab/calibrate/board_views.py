@@ -174,7 +174,7 @@ def _detections(job: _ImageJob) -> tuple[Detection, ...]:
     return tuple(_detect_in_worker(image) for image in job.images)
 
 
-# Views with stamps, from a rig whose cameras are calibrated.
+# Views with stamps, from a rig with calibrated cameras.
 
 _MONO_HINT = "for one camera, give --camera a camchain without cam1"
 

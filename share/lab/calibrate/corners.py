@@ -335,8 +335,7 @@ def _regularised(A: F64) -> F64:
 
 
 def _linearise(H: F64, board_xy: F64, image_xy: F64) -> tuple[F64, F64]:
-    """Return derivatives (N, M, 2, 8) of the prediction by H, whose last element is 1, and residuals (N,
-    M, 2)."""
+    """Return derivatives (N, M, 2, 8) of the prediction by H (last element 1), and residuals (N, M, 2)."""
     points = np.concatenate([board_xy, np.ones((*board_xy.shape[:2], 1))], axis=2)
     homogeneous = points @ H.swapaxes(1, 2)
     px, scaled = homogeneous[..., :2] / homogeneous[..., 2:], points / homogeneous[..., 2:]

@@ -20,7 +20,7 @@ STANDARD_GRAVITY = 9.80665  # m/s^2
 _QUIET_QUANTILE = 0.2  # the quietest fifth gives the sensor's noise
 _MAX_NOISE_SCALE = 2.0  # times that noise within a second: more is a knock
 _MAX_SHIFT_SIGMAS = 6.0  # standard errors of the difference of two means
-# Largest scatter of means over that of successive samples, whose white noise a sensor's filter hides.
+# Largest scatter of means over that of successive samples: a sensor's filter hides their white noise.
 _MAX_SMOOTHING = 6.0
 _MARGIN_WINDOWS = 2  # around a disturbance, left out too
 _MAX_GYRO_NOISE = 0.05  # rad/s: noisier than any IMU at rest

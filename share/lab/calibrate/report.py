@@ -1,4 +1,4 @@
-"""What the reports of all calibrations share: where files go, JSON, verdict on corners, cells with sigmas."""
+"""Common parts of the calibration reports: file names, JSON, verdict on corners, cells with sigmas."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def start_worker(stage: RoomStage, images: str) -> None:
 
 
 def meter_jobs(actor_index: int, actor: Actor) -> list[MeterJob]:
-    """Return jobs whose measurements `exposure_series` needs."""
+    """Return jobs that make the measurements for `exposure_series`."""
     true_ns = actor.pictures.true_ns
     times = np.append(np.arange(true_ns[0], true_ns[-1], _METER_INTERVAL_NS), true_ns[-1])
     return [MeterJob(actor_index, times[k : k + _METER_BATCH]) for k in range(0, len(times), _METER_BATCH)]

@@ -1,4 +1,4 @@
-"""A device's profile with pictures of a size that it does not have, for experiments that must be quick."""
+"""A device's profile with smaller pictures than the device has, for quick experiments."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ I32 = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles. vertices (V, 3) m and unit normals (V, 3); uv (V, 2): position in a picture, whose width is
-    1 and which repeats; layer (V,): index of the picture, the same for all corners of a triangle; faces (F,
+    """Triangles. vertices (V, 3) m and unit normals (V, 3); uv (V, 2): position in a picture of width
+    1 that repeats; layer (V,): index of the picture, the same for all corners of a triangle; faces (F,
     3): corners, counter-clockwise from outside (both sides are drawn)."""
 
     vertices: F32

@@ -1,4 +1,4 @@
-"""What `share evaluate paper` plays: sessions, policies, gains; a quick form and the whole of it."""
+"""The runs of `share evaluate paper`: sessions, policies, gains; a quick form and the whole."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from share.config import BASE_POLICY, STREAMED, Config
 from share.lab.emulate.recipe import SessionRecipe
 from share.lab.evaluate.campaign import PlannedRun, plan_policies
 from share.lab.evaluate.real_time import RunOptions
-from share.lab.evaluate.sweep import Axis, grid, plan_sweep
+from share.lab.evaluate.sweep import SweepAxis, grid, plan_sweep
 from share.recordings.session import Session
 
 BASE, OURS, THEIRS = BASE_POLICY, "share", "share-paper"
@@ -65,9 +65,11 @@ class PaperRuns:
         return [*self.compared, *self.streamed, *(run for runs in self.swept.values() for run, _ in runs)]
 
 
-def axes_of(plan: PaperPlan, pair: tuple[str, str]) -> list[Axis]:
+def axes_of(plan: PaperPlan, pair: tuple[str, str]) -> list[SweepAxis]:
     """Return the axes of a heat map."""
-    return [Axis((f"control.{name}",), tuple(f"{value:g}" for value in plan.gains[name])) for name in pair]
+    return [
+        SweepAxis((f"control.{name}",), tuple(f"{value:g}" for value in plan.gains[name])) for name in pair
+    ]
 
 
 def plan_runs(plan: PaperPlan, sessions: Sequence[Session], config: Config, out: Path) -> PaperRuns:

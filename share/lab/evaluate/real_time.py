@@ -107,9 +107,9 @@ class RunOptions:
 
 
 @dataclass(frozen=True)
-class Pages:
-    """What the edge of a run serves to browsers. has_view: the live room beside the status page. show: is
-    called with a line for each page that says where it is."""
+class RunPages:
+    """The pages that the edge of a run serves. has_view: the live room beside the status page. show: is
+    called with a line with the address of each page."""
 
     has_view: bool
     show: Callable[[str], None]
@@ -133,7 +133,7 @@ def played_in_real_time(
     options: RunOptions,
     out: Path,
     show: Callable[[Progress], None],
-    pages: Pages | None = None,
+    pages: RunPages | None = None,
 ) -> Iterator[dict[str, Path]]:
     """Run `session` in real time until its agents have ended; the edge serves its pages until the block is
     left. Yields the folder of each agent's files, by name.

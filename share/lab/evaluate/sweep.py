@@ -28,7 +28,7 @@ Point = tuple[str, ...]  # a value of each axis, in YAML
 
 
 @dataclass(frozen=True)
-class Axis:
+class SweepAxis:
     """Settings (`section.name`) that share a value: one of `values`, or drawn from `low` to `high`."""
 
     names: tuple[str, ...]
@@ -45,7 +45,7 @@ class Axis:
         return not self.values
 
     @classmethod
-    def parse(cls, text: str) -> Axis:
+    def parse(cls, text: str) -> SweepAxis:
         """Parse `control.kp=0.2,0.8`, `control.kp=0.1:3` or `a.b+c.d=1,2`. Raises UsageError."""
         name, separator, values_text = text.partition("=")
         names = tuple(name.split("+"))
@@ -70,7 +70,7 @@ class Axis:
         return f"{self.low + (self.high - self.low) * u:.4g}"
 
 
-def grid(axes: Sequence[Axis]) -> list[Point]:
+def grid(axes: Sequence[SweepAxis]) -> list[Point]:
     """Return every combination, once. Raises UsageError where an axis is a range."""
     for axis in axes:
         if axis.is_range:
@@ -78,7 +78,7 @@ def grid(axes: Sequence[Axis]) -> list[Point]:
     return list(dict.fromkeys(itertools.product(*(axis.values for axis in axes))))
 
 
-def random_points(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
+def random_points(axes: Sequence[SweepAxis], count: int, seed: int) -> list[Point]:
     """Return `count` points, fewer where listed values make some of them equal.
 
     Deterministic for a given seed; a larger count extends the list.
@@ -88,7 +88,7 @@ def random_points(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
     return list(dict.fromkeys(points))
 
 
-def config_at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
+def config_at(config: Config, axes: Sequence[SweepAxis], point: Point) -> Config:
     """Return `config` with the settings of `point`. Raises ConfigError with the name of a wrong one."""
     mapping: dict[str, Any] = to_mapping(config)
     for axis, value in zip(axes, point, strict=True):
@@ -100,7 +100,7 @@ def config_at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
 
 def plan_sweep(
     sessions: Sequence[Session],
-    axes: Sequence[Axis],
+    axes: Sequence[SweepAxis],
     points: Sequence[Point],
     seeds: Sequence[int],
     options: RunOptions,
@@ -127,7 +127,7 @@ def plan_sweep(
     ]
 
 
-def sweep_table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunMetrics]]) -> list[dict[str, Any]]:
+def sweep_table(axes: Sequence[SweepAxis], runs: Sequence[tuple[Point, RunMetrics]]) -> list[dict[str, Any]]:
     """Return a row per point, in order of appearance: its settings, the number of runs, and the mean of
     each measure with its interval."""
     rows = []
@@ -144,7 +144,9 @@ def sweep_table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunMetrics]]) 
     return rows
 
 
-def heat_map(axes: Sequence[Axis], rows: Sequence[Mapping[str, Any]], measure: str) -> np.ndarray[Any, Any]:
+def heat_map(
+    axes: Sequence[SweepAxis], rows: Sequence[Mapping[str, Any]], measure: str
+) -> np.ndarray[Any, Any]:
     """Return (V0, V1): the mean of a measure by the first two axes' values, over all others."""
     first, second = axes[:2]
     out = np.full((len(first.values), len(second.values)), np.nan)
@@ -159,6 +161,6 @@ def heat_map(axes: Sequence[Axis], rows: Sequence[Mapping[str, Any]], measure: s
     return out
 
 
-def _run_name(session: Session, axes: Sequence[Axis], point: Point, seed: int) -> str:
+def _run_name(session: Session, axes: Sequence[SweepAxis], point: Point, seed: int) -> str:
     key_text = ";".join(f"{axis.name}={value}" for axis, value in zip(axes, point, strict=True))
     return f"{session.folder.resolve().name}-{seed}-{hashlib.sha256(key_text.encode()).hexdigest()[:10]}"

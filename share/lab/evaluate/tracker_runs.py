@@ -70,7 +70,7 @@ class _FaultsRaised(FaultGuard):
 
 
 def strict_tracker(source: Source, settings: Config) -> GuardedTracker:
-    """Return a tracker whose failures end the run: an experiment must not hide them.
+    """Return a tracker that ends the run when it fails: an experiment must not hide failures.
 
     Raises UsageError where none fits.
     """

@@ -20,7 +20,7 @@ from share.errors import ConfigError, DataError, UsageError
 from share.files.json_file import read_json, to_plain
 from share.files.writing import atomic_write, new_folder
 from share.lab.evaluate.provenance import code_digest, describe_machine
-from share.lab.evaluate.real_time import Pages, Progress, RunOptions, played_in_real_time
+from share.lab.evaluate.real_time import Progress, RunOptions, RunPages, played_in_real_time
 from share.lab.evaluate.virtual_time import play_in_virtual_time
 from share.plain_data import from_mapping, to_mapping
 from share.recordings.session import Session, read_session
@@ -71,7 +71,7 @@ def run_trial(
     config: Config,
     out: Path,
     show: Callable[[Progress], None],
-    pages: Pages | None = None,
+    pages: RunPages | None = None,
 ) -> Trial:
     """Play a session. `out` is complete or absent. The scheduler's random numbers follow the seed of
     `options`. pages: what to serve meanwhile, in real time.

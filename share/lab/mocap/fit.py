@@ -59,7 +59,7 @@ class MocapFit:
 
     * stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world; gyro_bias,
       accel_bias (N, 3).
-    * gaps (G, 2) ns, IMU clock: mocap gaps longer than are bridged. is_break (N - 1,) bool: nothing joins
+    * gaps (G, 2) ns, IMU clock: mocap gaps too long to bridge. is_break (N - 1,) bool: nothing joins
       this node to the next.
     * R_mocap_world (3, 3): from the levelled world to the mocap's; with a quarter or half turn where another
       axis than z is `up`.

@@ -66,7 +66,7 @@ class Head(nn.Module):  # type: ignore[misc]
 
 
 class Heads(nn.Module):  # type: ignore[misc]
-    """An ensemble of heads with different initial weights, whose mean errs less than each (deep ensembles,
+    """An ensemble of heads with different initial weights; their mean errs less than each (deep ensembles,
     Lakshminarayanan et al. 2017)."""
 
     def __init__(self, count: int, dropout: float = 0.0) -> None:

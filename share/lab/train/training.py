@@ -42,7 +42,7 @@ def train_model(
     on_epoch: ShowEpoch,
 ) -> TrainedHeads:
     """Return the heads trained on the collection. deep_features (N, 1280): of the table's pictures, by the
-    backbone whose id (`network.backbone_id`) is `backbone`."""
+    backbone with the id `backbone` (`network.backbone_id`)."""
     scale = Standardiser(deep_features, collection)
     parts = {name: scale.inputs(name) for name in collection.parts}
     heads = train_heads(parts["train"], parts["validate"], options, checkpoint, on_epoch)
@@ -115,7 +115,7 @@ def _tensors(inputs: Inputs) -> list[torch.Tensor]:
 @dataclass(frozen=True)
 class TrainingOptions:
     """epochs: at most. patience: epochs without a gain before training stops. dropout: of backbone features,
-    since there are few rooms and many pictures of each. heads: number of heads whose mean is the prediction.
+    since there are few rooms and many pictures of each. heads: number of heads; their mean is the prediction.
     """
 
     epochs: int = 200

@@ -36,7 +36,7 @@ _SDK_PREFIX = "/device_0/"  # of topics in recordings of the RealSense SDK, whic
 
 
 class BagMetadata(NamedTuple):
-    """What metadata.yaml says. files: of the bag, in order."""
+    """The content of metadata.yaml. files: of the bag, in order."""
 
     storage: str
     compression: str

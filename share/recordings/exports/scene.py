@@ -1,4 +1,4 @@
-"""What is exported: agents that move in one frame, and pictures that they took with points in them."""
+"""The content of an export: agents that move in one frame, and their pictures with points."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ class McapFile(MessageFile):
 
 
 class BoundedFile:
-    """A file whose reads are limited to what is left: Python allocates the size asked for beforehand."""
+    """A file that reads at most what is left: Python allocates the requested size beforehand."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file

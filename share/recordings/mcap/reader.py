@@ -25,7 +25,7 @@ from share.recordings.losses import DataLosses
 from share.recordings.mcap import ros_messages as ros
 from share.recordings.mcap.rig import own_rig, own_serial
 from share.recordings.message_file import MessageFile
-from share.recordings.recording import UNBOUNDED_NS, Recording, select_span
+from share.recordings.recording import UNBOUNDED_NS, Recording, select_time_range
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
 from share.sensors.sequencer import rig_streams
@@ -76,7 +76,7 @@ class McapSource(Recording):
         if calibration:
             self.notes += device_mismatch(calibration.serials, self.serial)
         stamps = self.all_stamps()[CAM0] if frames is None else self._header_stamps()
-        self.span = select_span(stamps, frames, str(file.path), self.rig.timeshift_ns)
+        self.time_range = select_time_range(stamps, frames, str(file.path), self.rig.timeshift_ns)
 
     def all_stamps(self) -> dict[str, I64]:
         return {stream: self.file.log_times[topic] for stream, topic in self._topics.items()}
@@ -126,8 +126,8 @@ class McapSource(Recording):
 
     @property
     def _log_range(self) -> tuple[int | None, int | None]:
-        first = min(self.span.imu_from, self.span.image_from)
-        last = max(self.span.imu_to, self.span.image_to)
+        first = min(self.time_range.imu_from, self.time_range.image_from)
+        last = max(self.time_range.imu_to, self.time_range.image_to)
         return (
             None if first <= -UNBOUNDED_NS else max(0, first - _MAX_SKEW_NS),
             None if last >= UNBOUNDED_NS else last + _MAX_SKEW_NS,
@@ -234,6 +234,6 @@ def read_imu(file: MessageFile, progress: Callable[[int, int], None], losses: Da
 
 
 def unwrap_stamps(stamps_ns: I64) -> I64:
-    """Unwrap the stamps (N,) ns of a D4xx, whose counter restarts every 71 minutes."""
+    """Unwrap the stamps (N,) ns of a D4xx: its counter restarts every 71 minutes."""
     back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < -WRAP_NS // 2
     return np.asarray(stamps_ns + WRAP_NS * np.cumsum(back), np.int64)

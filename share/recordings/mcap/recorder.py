@@ -2,7 +2,7 @@
 
 Topics are those of `share.recordings.mcap.ros_messages.TOPICS`. The file grows as NAME.part, in chunks of at
 most 256 kB (or one image), and gets its name when it is closed. After a crash `recover_recording` copies
-every intact message of the `.part`, which has no index, and whose last chunk may be incomplete: it is read
+every intact message of the `.part`. That has no index, and its last chunk may be incomplete: it is read
 from the start, record by record, as far as possible.
 """
 

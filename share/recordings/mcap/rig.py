@@ -186,7 +186,7 @@ def _rig_record(file: MessageFile) -> dict[str, str]:
 def _rig_from_messages(file: MessageFile, topics: dict[str, str]) -> Rig | None:
     """Return the rig of CameraInfo and /tf_static, None without cam0's CameraInfo.
 
-    Raises ConfigError for a recording with an IMU, whose noise no message states.
+    Raises ConfigError for a recording with an IMU: no message states its noise.
     """
     infos: dict[str, Any] = {s: _camera_info(file, topics[s]) for s in (CAM0, CAM1, DEPTH) if s in topics}
     if infos[CAM0] is None:

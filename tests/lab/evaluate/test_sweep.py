@@ -13,10 +13,10 @@ from share.config import Config
 from share.errors import ConfigError, UsageError
 from share.lab.evaluate.real_time import RunOptions
 from share.lab.evaluate.statistics import MEASURES
-from share.lab.evaluate.sweep import Axis, config_at, grid, heat_map, plan_sweep, random_points
+from share.lab.evaluate.sweep import SweepAxis, config_at, grid, heat_map, plan_sweep, random_points
 from share.recordings.session import Session
 
-KP, KI = Axis.parse("control.kp=0.2,0.8"), Axis.parse("control.ki=0,0.1,1e-3")
+KP, KI = SweepAxis.parse("control.kp=0.2,0.8"), SweepAxis.parse("control.ki=0,0.1,1e-3")
 
 
 @pytest.mark.parametrize(
@@ -25,17 +25,17 @@ KP, KI = Axis.parse("control.kp=0.2,0.8"), Axis.parse("control.ki=0,0.1,1e-3")
 )
 def test_malformed_axes_are_refused(text):
     with pytest.raises(UsageError, match=f"--set {text}: "):
-        Axis.parse(text)
+        SweepAxis.parse(text)
 
 
 def test_a_grid_is_every_combination():
     assert grid([KP, KI]) == [(p, i) for p in ("0.2", "0.8") for i in ("0", "0.1", "1e-3")]
     with pytest.raises(UsageError, match="a range needs --random N"):
-        grid([Axis.parse("control.kp=1:2")])
+        grid([SweepAxis.parse("control.kp=1:2")])
 
 
 def test_random_points_are_log_uniform_and_repeatable():
-    axes = [Axis.parse("control.kp=0.1:10"), Axis.parse("control.ki=0:2"), KI]
+    axes = [SweepAxis.parse("control.kp=0.1:10"), SweepAxis.parse("control.ki=0:2"), KI]
     points = random_points(axes, 2000, seed=0)
     kp, ki = (np.array([float(point[k]) for point in points]) for k in (0, 1))
     assert 0.1 <= kp.min() < 0.12 < 8 < kp.max() <= 10
@@ -47,19 +47,19 @@ def test_random_points_are_log_uniform_and_repeatable():
 
 
 def test_a_point_is_played_once_however_often_it_is_named_or_drawn():
-    assert grid([Axis.parse("control.kp=1,1,2")]) == [("1",), ("2",)]
+    assert grid([SweepAxis.parse("control.kp=1,1,2")]) == [("1",), ("2",)]
     assert sorted(random_points([KP, KI], 50, seed=0)) == sorted(grid([KP, KI]))
 
 
 def test_a_point_changes_its_settings_and_no_other():
-    tied = Axis.parse("control.rate_min_hz+control.rate_max_hz=2,3")
+    tied = SweepAxis.parse("control.rate_min_hz+control.rate_max_hz=2,3")
     config = config_at(Config(), [KP, tied], ("0.2", "3"))
     assert config.control.kp == 0.2
     assert (config.control.rate_min_hz, config.control.rate_max_hz) == (3, 3)
     assert config.edge == Config().edge
     assert config.control.kd == Config().control.kd
     with pytest.raises(ConfigError, match="unknown key 'kpp'; did you mean 'kp'"):
-        config_at(Config(), [Axis.parse("control.kpp=1")], ("1",))
+        config_at(Config(), [SweepAxis.parse("control.kpp=1")], ("1",))
 
 
 def test_every_run_has_a_folder_of_its_own():
@@ -75,7 +75,7 @@ def test_every_run_has_a_folder_of_its_own():
 
 
 def test_a_policy_of_the_sweep_is_played():
-    axis = Axis.parse("edge.policy=equal,linear")
+    axis = SweepAxis.parse("edge.policy=equal,linear")
     options = RunOptions("share")
     runs = plan_sweep([Session(Path("a"), {}, {})], [axis], grid([axis]), [0], options, Path("out"), Config())
     assert [one.options.policy for one, _ in runs] == ["equal", "linear"]
@@ -84,7 +84,7 @@ def test_a_policy_of_the_sweep_is_played():
 
 
 def test_heat_is_the_mean_over_all_other_settings():
-    third = Axis.parse("control.kd=0,1")
+    third = SweepAxis.parse("control.kd=0,1")
     measure = MEASURES[0].name
     rows = [
         {

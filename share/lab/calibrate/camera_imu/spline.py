@@ -47,7 +47,7 @@ def blending(u: F64, derivative: int) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class KnotSpan:
-    """Positions on a curve: segment (N,), whose knots are segment .. segment + 5, and u (N,) in it."""
+    """Positions on a curve: segment (N,), with the knots segment .. segment + 5, and u (N,) in it."""
 
     segment: I64
     u: F64

@@ -299,7 +299,7 @@ def _obstacles(
     tracks: Mapping[int, PlanarTrack],
     i: int,
 ) -> list[MovingObstacle]:
-    """Return what member i must keep off: all whose motion is planned."""
+    """Return the obstacles of member i: all with a planned motion."""
     own = members[i].preferences
     fixed_tracks = [(p.xyz[:, :2], p.distance) for p in fixed]
     fixed_tracks += [(track.xy, members[k].preferences.distance) for k, track in tracks.items()]

@@ -127,7 +127,7 @@ def _pivot_route(xy: F64, before: float, after: float) -> Route:
 
 
 def rumble_displacement(count: int, rng: Rng) -> F64:
-    """Return displacement (M,) m whose acceleration has rms 1 m/s^2, in a band with one soft resonance."""
+    """Return displacement (M,) m with an acceleration of rms 1 m/s^2, in a band with one soft resonance."""
     hz = np.fft.rfftfreq(count, KNOT_S)
     low, peak, high = _RUMBLE_BAND_HZ
     shape = np.exp(-0.5 * (np.log(np.maximum(hz, 1e-3) / peak) / 0.5) ** 2) * (hz > low) * (hz < high)

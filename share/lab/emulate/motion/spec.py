@@ -173,7 +173,7 @@ _OPTION = re.compile(r"\s*([a-z_]+)=(.*)", re.DOTALL)
 
 
 def parse_motion(text: str) -> tuple[str | None, Spec]:
-    """Return (name or None, spec) of `NAME=SPEC` or `SPEC`. Raises UsageError that says what is wrong."""
+    """Return (name or None, spec) of `NAME=SPEC` or `SPEC`. Raises UsageError."""
     named = _NAME.fullmatch(text)
     name, spec = (named[1], named[2]) if named else (None, text)
     if name is not None and not _VALID_NAME.fullmatch(name):

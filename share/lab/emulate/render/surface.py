@@ -1,4 +1,4 @@
-"""What a pinhole view shows of a surface: chunks of triangles, so that those outside the view are skipped."""
+"""The visible part of a surface in a pinhole view: chunks of triangles outside the view are skipped."""
 
 from __future__ import annotations
 

@@ -36,8 +36,8 @@ _IGNORED_TYPE = "image/ktx2"  # trimesh ignores it
 
 
 def read_gltf(path: Path) -> tuple[bytes, dict[str, bytes]]:
-    """Return a glTF file and, by name, the files that it names. Raises DataError that says what is wrong or
-    too large."""
+    """Return a glTF file and, by name, the files that it names. Raises DataError if they are malformed or too
+    large."""
     try:
         data = read_bytes(path, _MAX_BYTES)
         text, binary = _chunks(data) if path.suffix.lower() == ".glb" else (data, b"")

@@ -29,7 +29,7 @@ _PRINT_INSET = 0.004  # of a picture; keeps prints clear of their neighbours
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh whose `layer` indexes `materials`: its pictures are not drawn yet."""
+    """A mesh with a `layer` that indexes `materials`: its pictures are not drawn yet."""
 
     mesh: Mesh
     materials: tuple[Material | GivenMaterial, ...]

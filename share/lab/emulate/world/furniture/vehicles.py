@@ -1,4 +1,4 @@
-"""Vehicles: a fire engine and a van, whose fronts point to -y and whose rear is y = 0; trucks for pallets."""
+"""Vehicles: a fire engine and a van (front towards -y, rear at y = 0); trucks for pallets."""
 
 from __future__ import annotations
 

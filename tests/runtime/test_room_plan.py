@@ -13,7 +13,7 @@ from share.geometry import se3
 from share.mapping.corrections import map_assignment
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult
 from share.protocol.peer import RestoredRun
-from share.runtime.plan import Plan
+from share.runtime.room_plan import RoomPlan
 from share.types import F64, AgentKind, TrackState
 from share.wire.messages import PoseUpdate
 
@@ -26,31 +26,31 @@ def at(x: float, y: float) -> F64:
     return T
 
 
-def walked(plan: Plan, *steps: tuple[float, float], keyframe: int = 0) -> None:
+def walked(plan: RoomPlan, *steps: tuple[float, float], keyframe: int = 0) -> None:
     """Poses relative to a keyframe, all of them seen."""
     for x, y in steps:
         for _ in range(4):
             plan.add_poses({ANN: PoseUpdate(0, TrackState.OK, keyframe, at(x, y))})
 
 
-def keyframe(plan: Plan, id_: int, T_odom_body: F64, begins: bool = False) -> None:
+def keyframe(plan: RoomPlan, id_: int, T_odom_body: F64, begins: bool = False) -> None:
     one = mc.keyframe(ANN, id_, first=begins).keyframe
     plan.add_effect(AddKeyframe(ANN, replace(one, T_odom_body=T_odom_body)))
 
 
-def corrected(plan: Plan, T_map_odom: F64, segment_keyframe: int = 0, map_id: str = "A") -> None:
+def corrected(plan: RoomPlan, T_map_odom: F64, segment_keyframe: int = 0, map_id: str = "A") -> None:
     plan.add_result(MapperResult((map_assignment(ANN, map_id, T_map_odom, segment_keyframe),)))
 
 
 @pytest.fixture
-def plan() -> Plan:
-    out = Plan()
+def plan() -> RoomPlan:
+    out = RoomPlan()
     out.add_effect(AddRun(ANN, hello_of("ann", 1, AgentKind.ROBOT)))
     keyframe(out, 0, at(1.0, 0.0), begins=True)
     return out
 
 
-def test_a_path_is_odometrys_in_the_map(plan: Plan) -> None:
+def test_a_path_is_odometrys_in_the_map(plan: RoomPlan) -> None:
     walked(plan, (0.0, 0.0), (0.5, 0.0), (0.52, 0.0), (1.0, 0.0))
     assert plan.report() == {"agents": {}}  # not before its place is known
     corrected(plan, se3.exp(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0])))
@@ -61,7 +61,7 @@ def test_a_path_is_odometrys_in_the_map(plan: Plan) -> None:
 
 def test_it_looks_where_its_camera_looks() -> None:
     T_body_cam0 = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    plan = Plan()
+    plan = RoomPlan()
     plan.add_effect(AddRun(ANN, hello_of("ann", 1, T=T_body_cam0)))
     keyframe(plan, 0, at(0.0, 0.0), begins=True)
     corrected(plan, se3.exp(np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])))
@@ -69,7 +69,7 @@ def test_it_looks_where_its_camera_looks() -> None:
     assert plan.report()["agents"]["ann"]["heading"] == 0.5
 
 
-def test_each_segment_stays_in_its_map(plan: Plan) -> None:
+def test_each_segment_stays_in_its_map(plan: RoomPlan) -> None:
     corrected(plan, at(0.0, 0.0))
     walked(plan, (0.0, 0.0), (1.0, 0.0))
     keyframe(plan, 1, at(0.0, 0.0), begins=True)
@@ -84,7 +84,7 @@ def test_each_segment_stays_in_its_map(plan: Plan) -> None:
     ]
 
 
-def test_it_keeps_little(plan: Plan) -> None:
+def test_it_keeps_little(plan: RoomPlan) -> None:
     corrected(plan, at(0.0, 0.0))
     walked(plan, *((0.2 * k, 0.0) for k in range(3000)))
     path = plan.report()["agents"]["ann"]["parts"][0]["path"]
@@ -95,7 +95,7 @@ def test_it_keeps_little(plan: Plan) -> None:
     assert plan.report()["agents"]["ann"]["position"][1] == 0.0
 
 
-def test_a_run_that_comes_back_is_drawn_and_one_that_is_forgotten_is_not(plan: Plan) -> None:
+def test_a_run_that_comes_back_is_drawn_and_one_that_is_forgotten_is_not(plan: RoomPlan) -> None:
     corrected(plan, at(0.0, 0.0))
     walked(plan, (1.0, 0.0))
     plan.begin_session(None, [RestoredRun(ANN, hello_of("ann", 1), None)])
@@ -105,7 +105,7 @@ def test_a_run_that_comes_back_is_drawn_and_one_that_is_forgotten_is_not(plan: P
     plan.add_poses({ANN: PoseUpdate(0, TrackState.OK, 0, at(0.0, 0.0))})
 
 
-def test_a_long_path_keeps_its_bends_and_its_newest_part(plan: Plan) -> None:
+def test_a_long_path_keeps_its_bends_and_its_newest_part(plan: RoomPlan) -> None:
     """Rounds of a circle of 1.5 m, as someone walks for an hour: no chord may cut across."""
     corrected(plan, at(0.0, 0.0))
     angles = np.linspace(0.0, 200 * np.pi, 40_000)

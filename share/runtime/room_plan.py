@@ -96,7 +96,7 @@ class _Run:
         return {"kind": self.kind, "map_id": map_id, "parts": parts, "position": where, "heading": heading}
 
 
-class Plan(EdgeObserver):
+class RoomPlan(EdgeObserver):
     """Keeps what is drawn. `report` may be called from any thread."""
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ from share.mapping.map_changes import SavePoses
 from share.types import AgentKind
 from share.view import drawing as dr
 from share.view import events as ev
-from share.view.events import MAX_KEYFRAMES, Recap
+from share.view.events import MAX_KEYFRAMES, SessionSnapshot
 from share.view.room import DrawnRoom
 
 
@@ -29,7 +29,7 @@ def drawn(events: list[ev.RoomEvent]) -> dict[str, object]:
         room.apply(event, 0.0)
     while room.waiting:
         for one in room.take_drawings(10.0):
-            if isinstance(one, dr.Removed):
+            if isinstance(one, dr.RemoveDrawing):
                 out.pop(one.name, None)
             elif isinstance(one, dr.Points | dr.Lines):
                 out[one.name] = one.origin.round(6).tolist()
@@ -46,19 +46,19 @@ def test_it_leads_to_the_same_room() -> None:
     events.append(ev.MapsSolved(SavePoses(keys, np.array([at(2 * k.id) for k in keys]), ("A",) * len(keys))))
     events += [ev.LoopAccepted(KeyframeKey("ann", k), KeyframeKey("bob", k)) for k in range(5)]
     events += [ev.LoopsRemoved(KeyframeKey("bob", 1), KeyframeKey("ann", 1)), ev.RunRemoved("eve")]
-    recap = Recap()
+    snapshot = SessionSnapshot()
     for event in events:
-        recap.apply(event)
-    assert drawn(list(recap.events())) == drawn(events)
-    assert len(list(recap.events())) == 1 + 2 + 80 + 2 + 1 + 4
+        snapshot.apply(event)
+    assert drawn(list(snapshot.events())) == drawn(events)
+    assert len(list(snapshot.events())) == 1 + 2 + 80 + 2 + 1 + 4
 
 
 def test_what_is_gone_and_pictures_are_not_kept() -> None:
-    recap = Recap()
+    snapshot = SessionSnapshot()
     for k in range(MAX_KEYFRAMES + 10):
-        recap.apply(shown("ann", k))
-    recap.apply(ev.LoopAccepted(KeyframeKey("ann", 20), KeyframeKey("ann", 21)))
-    recap.apply(ev.KeyframesRemoved((KeyframeKey("ann", 20),)))
-    kept = [one for one in recap.events() if isinstance(one, ev.KeyframeArrived)]
+        snapshot.apply(shown("ann", k))
+    snapshot.apply(ev.LoopAccepted(KeyframeKey("ann", 20), KeyframeKey("ann", 21)))
+    snapshot.apply(ev.KeyframesRemoved((KeyframeKey("ann", 20),)))
+    kept = [one for one in snapshot.events() if isinstance(one, ev.KeyframeArrived)]
     assert len(kept) == MAX_KEYFRAMES - 1 and not any(one.jpeg for one in kept)
-    assert not any(isinstance(one, ev.LoopAccepted) for one in recap.events())
+    assert not any(isinstance(one, ev.LoopAccepted) for one in snapshot.events())

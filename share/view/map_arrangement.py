@@ -13,7 +13,7 @@ from share.types import F64
 _MAP_SPACING_M = 10.0  # between maps that are not joined
 
 
-class MapPlaces:
+class MapArrangement:
     """Follows which map each keyframe is in. A change takes as long as what it moves is large."""
 
     def __init__(self) -> None:
