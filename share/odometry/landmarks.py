@@ -332,7 +332,7 @@ class LandmarkMap:
         Never the newest two, nor those in `held_ids`, between which motions are published.
         """
         s = self.state
-        is_active = np.isin(np.arange(len(s.keyframe_ids)), s.anchor)
+        is_active = np.bincount(s.anchor, minlength=len(s.keyframe_ids)) > 0
         dropped = ~is_active & ~self._dormant.has_features(s.keyframe_ids)
         is_held = np.isin(s.keyframe_ids, held_ids)
         is_held[-2:] = True
@@ -350,7 +350,8 @@ class LandmarkMap:
         if not dropped.any():
             return
         self._dormant.drop_keyframes(s.keyframe_ids[dropped])
-        self.appearance = self.appearance.take(~dropped[s.anchor])
+        if (is_active & dropped).any():
+            self.appearance = self.appearance.take(~dropped[s.anchor])
         state.drop_keyframes(s, s.keyframe_ids[dropped])
 
 
