@@ -111,9 +111,8 @@ def _peaks(image: U8, first: int, end: int) -> tuple[I64, F32]:
     rows = slice(max(first, _BORDER_PX) - above, min(end, len(image) - _BORDER_PX) - above)
     inside = rows, slice(_BORDER_PX, image.shape[1] - _BORDER_PX)
     strength, local_max = strength[inside], local_max[inside]
-    y, x = np.divmod(np.flatnonzero(strength == local_max), max(strength.shape[1], 1))
-    is_corner = strength[y, x] > _MIN_EIGENVALUE
-    y, x = y[is_corner], x[is_corner]
+    is_peak = (strength == local_max) & (strength > _MIN_EIGENVALUE)
+    y, x = np.divmod(np.flatnonzero(is_peak), max(strength.shape[1], 1))  # faster than np.nonzero
     return np.column_stack([x, y]) + (_BORDER_PX, rows.start + above), strength[y, x]
 
 
