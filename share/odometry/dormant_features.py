@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from share.array_table import ArrayTable
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.odometry import feature_matching
+from share.odometry import feature_matching, filter
 from share.odometry.feature_appearance import Appearance
-from share.odometry.state import FilterState
+from share.odometry.state import CORE_SIZE, KEYFRAMES_START, FilterState
 from share.types import F64, I64
 
 _MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth that is kept
@@ -127,3 +127,17 @@ class DormantFeatures:
         # Keyframes that come when there are enough already are left out.
         is_searched = rank <= rank[min(_MAX_SEARCHED, len(rank)) - 1]
         return replace(self._table.take(rows[is_searched]), anchor=nearest[rank[is_searched]])
+
+
+def nis(state: FilterState, rows: filter.FeatureMeasurements, rho_sigma: F64) -> F64:
+    """Return the NIS (M,) of measurements of dormant features, which the state does not have: their inverse
+    depths err by rho_sigma (M,) 1/m, independently."""
+    M = len(rows.feature)
+    columns = np.empty((M, CORE_SIZE + 6), np.int64)
+    columns[:, :CORE_SIZE] = np.arange(CORE_SIZE)
+    columns[:, CORE_SIZE:] = KEYFRAMES_START + 6 * rows.anchor[:, None] + np.arange(6)
+    H = np.concatenate([rows.H_core, rows.H_anchor], axis=2)
+    S = H @ state.cov[columns[:, :, None], columns[:, None, :]] @ H.swapaxes(1, 2)
+    S += rows.H_rho[:, :, None] * rows.H_rho[:, None, :] * (rho_sigma**2)[:, None, None]
+    S += (rows.sigma**2 + rows.correlated_sigma**2)[:, None, None] * np.eye(2)
+    return filter.residual_nis(rows.residual, S[:, 0, 0], S[:, 0, 1], S[:, 1, 1])

@@ -312,9 +312,7 @@ def _project_with_jacobians(
     return uv, D, J_rho
 
 
-def is_in_view(
-    state: FilterState, camera: Camera, anchor: I64, ray: F64, rho: F64
-) -> NDArray[np.bool_]:
+def is_in_view(state: FilterState, camera: Camera, anchor: I64, ray: F64, rho: F64) -> NDArray[np.bool_]:
     """Return which points (N,) on rays (N, 2) of the keyframes with indices `anchor` (N,), at inverse depths
     (N,), are in cam0's view."""
     T = _keyframes_in_camera(state)[anchor]

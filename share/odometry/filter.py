@@ -202,29 +202,15 @@ def nis(rows: FeatureMeasurements, S: FloatArray) -> F64:
     M = len(rows.feature)
     a, b = 2 * np.arange(M), 2 * np.arange(M) + 1
     inflation = (CORRELATION_INFLATION - 1) * rows.correlated_sigma**2  # a single error is not inflated
-    return _nis(rows.residual, S[a, a] - inflation, S[a, b], S[b, b] - inflation)
+    return residual_nis(rows.residual, S[a, a] - inflation, S[a, b], S[b, b] - inflation)
 
 
-def _nis(residual: F64, sxx: FloatArray, sxy: FloatArray, syy: FloatArray) -> F64:
+def residual_nis(residual: F64, sxx: FloatArray, sxy: FloatArray, syy: FloatArray) -> F64:
     """Return the NIS (M,) of residuals (M, 2) with covariances [[sxx, sxy], [sxy, syy]], each (M,)."""
     x, y = residual.T
     distance = (syy * x * x - 2 * sxy * x * y + sxx * y * y) / (sxx * syy - sxy * sxy)
     out: F64 = np.where(np.isfinite(distance), distance, np.inf)
     return out
-
-
-def independent_nis(state: FilterState, rows: FeatureMeasurements, rho_sigma: F64) -> F64:
-    """Return the NIS (M,) of measurements of features that the covariance does not have: their inverse depths
-    err by rho_sigma (M,) 1/m, independently."""
-    M = len(rows.feature)
-    columns = np.empty((M, CORE_SIZE + 6), np.int64)
-    columns[:, :CORE_SIZE] = np.arange(CORE_SIZE)
-    columns[:, CORE_SIZE:] = KEYFRAMES_START + 6 * rows.anchor[:, None] + np.arange(6)
-    H = np.concatenate([rows.H_core, rows.H_anchor], axis=2)
-    S = H @ state.cov[columns[:, :, None], columns[:, None, :]] @ H.swapaxes(1, 2)
-    S += rows.H_rho[:, :, None] * rows.H_rho[:, None, :] * (rho_sigma**2)[:, None, None]
-    S += (rows.sigma**2 + rows.correlated_sigma**2)[:, None, None] * np.eye(2)
-    return _nis(rows.residual, S[:, 0, 0], S[:, 0, 1], S[:, 1, 1])
 
 
 def relinearised_rows(

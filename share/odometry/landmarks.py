@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.odometry import feature_appearance, feature_matching, filter, initial_depth, state
+from share.odometry import (
+    dormant_features,
+    feature_appearance,
+    feature_matching,
+    filter,
+    initial_depth,
+    state,
+)
 from share.odometry.dormant_features import DormantFeatures, DormantTable
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches, Prediction
@@ -312,7 +319,7 @@ class LandmarkMap:
         matches = feature_matching.match_features(frame, self._rig, means, dormant.appearance, cam0_only=True)
         found = np.flatnonzero(matches.is_found)
         rows = self._measurements(means, found, matches.at[found], None, rate)
-        recognised = found[filter.independent_nis(self.state, rows, dormant.sigma[found]) < filter.GATE]
+        recognised = found[dormant_features.nis(self.state, rows, dormant.sigma[found]) < filter.GATE]
         dormant.appearance.last_px[recognised] = matches.px[recognised]
         return dormant.take(recognised)
 

@@ -34,9 +34,9 @@ def detect(
     """Return up to `count` new corners (N, 2) px, at least `spacing` px from each other and from occupied_px
     (M, 2).
 
-    mask (H, W): 255 where corners may be. peaks: of this image, if some are known. Minimum-eigenvalue corners (Shi and Tomasi 1994), with subpixel
-    refinement. Cells with few points come first, so that a poster does not take all corners; those in
-    `occupied_px` count.
+    mask (H, W): 255 where corners may be. peaks: of this image, if some are known. Minimum-eigenvalue corners
+    (Shi and Tomasi 1994), with subpixel refinement. Cells with few points come first, so that a poster does
+    not take all corners; those in `occupied_px` count.
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)
@@ -113,7 +113,7 @@ def _peaks(image: U8, first: int, end: int) -> tuple[I64, F32]:
     strength, local_max = strength[inside], local_max[inside]
     is_peak = (strength == local_max) & (strength > _MIN_EIGENVALUE)
     y, x = np.divmod(np.flatnonzero(is_peak), max(strength.shape[1], 1))  # faster than np.nonzero
-    return np.column_stack([x, y]) + (_BORDER_PX, rows.start + above), strength[y, x]
+    return np.column_stack([x + _BORDER_PX, y + (rows.start + above)]), strength[y, x]
 
 
 def _spaced(px: I64, occupied_px: F32, count: int, spacing: float, shape: tuple[int, ...]) -> I64:

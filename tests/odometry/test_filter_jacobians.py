@@ -8,7 +8,7 @@ import pytest
 from helpers.imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
-from share.odometry import feature_matching, filter
+from share.odometry import dormant_features, feature_matching, filter
 from share.odometry import state as filter_state
 from share.odometry.imu_propagation import integrate
 from share.odometry.state import CORE_SIZE, TIMESHIFT, initial_state
@@ -124,7 +124,7 @@ def test_nis_of_features_outside_the_state_is_that_in_it(state):
     uv = seen.uv + rng.normal(0, 0.01, (3, 2))
     rows = filter.feature_measurements(grown, which, seen, uv, np.full(3, 1e-3), np.full(3, 2e-3), rate)
     _, S = filter.innovation_covariance(grown, rows, double_precision=True)
-    assert np.allclose(filter.independent_nis(state, rows, sigma), filter.nis(rows, S), rtol=1e-9)
+    assert np.allclose(dormant_features.nis(state, rows, sigma), filter.nis(rows, S), rtol=1e-9)
 
 
 def numeric_cov(state, motion):
