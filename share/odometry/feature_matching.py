@@ -328,4 +328,5 @@ def anchors_in_camera(state: FilterState, indices: I64 | slice = slice(None)) ->
 
 def _keyframes_in_camera(state: FilterState) -> F64:
     """Return T_cam_keyframe (K, 4, 4): from cam0 of each keyframe to cam0 now."""
-    return se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
+    out: F64 = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
+    return out
