@@ -42,12 +42,17 @@ def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> 
     """Return `value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (tolerance
     1e-3) or its translation exceeds `max_m`."""
     T = checked_array(name, value, (4, 4), np.float64)
-    rows = T.tolist()
-    if not _is_rigid(*rows):
-        raise ValueError(f"{name}: is not a rigid transform")
-    if not max(abs(row[3]) for row in rows) <= max_m:
-        raise ValueError(f"{name}: is more than {max_m:g} m away")
+    check_poses(name, T[None], max_m)
     return T
+
+
+def check_poses(name: str, poses: NDArray[np.floating[Any]], max_m: float = MAX_POSITION_M) -> None:
+    """Raise ValueError unless all poses (N, 4, 4), finite, are as `checked_pose` wants them."""
+    for rows in poses.tolist():
+        if not _is_rigid(*rows):
+            raise ValueError(f"{name}: is not a rigid transform")
+        if not max(abs(row[3]) for row in rows) <= max_m:
+            raise ValueError(f"{name}: is more than {max_m:g} m away")
 
 
 def checked_id(name: str, value: int, minimum: int = 0) -> int:

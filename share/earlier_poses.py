@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from share.checks import MAX_ODOM_M, check_covs, checked_array, checked_pose
+from share.checks import MAX_ODOM_M, check_covs, check_poses, checked_array
 
 MAX_EARLIER = 32  # keyframes to which a tracker gives a candidate's pose
 MAX_SPANS = 8  # of them, in a keyframe that is sent; agents send three
@@ -39,8 +39,7 @@ class EarlierPoses:
             raise ValueError("earlier: a keyframe occurs twice")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        for T in self.T_earlier_body:
-            checked_pose("T_earlier_body", T, MAX_ODOM_M)
+        check_poses("T_earlier_body", self.T_earlier_body, MAX_ODOM_M)
         check_covs("earlier.cov", self.cov.astype(np.float64))
 
     def __len__(self) -> int:

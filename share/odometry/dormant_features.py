@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from share.array_table import ArrayTable
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.odometry import feature_matching
+from share.odometry import feature_matching, filter
 from share.odometry.feature_appearance import Appearance
-from share.odometry.state import FilterState
+from share.odometry.state import CORE_SIZE, KEYFRAMES_START, FilterState
 from share.types import F64, I64
 
 _MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth that is kept
@@ -80,6 +80,17 @@ class DormantFeatures:
         self._keyframe[free] = keyframe_ids
         self._number[free] = np.arange(self._next_number, self._next_number + count)
         self._next_number += count
+        for keyframe_id in np.unique(keyframe_ids).tolist():
+            self._keep_most_certain(keyframe_id)
+
+    def _keep_most_certain(self, keyframe_id: int) -> None:
+        """Free the rows of the least certain features of a keyframe that has too many."""
+        rows = np.flatnonzero(self._keyframe == keyframe_id)
+        if self._table is None or len(rows) <= _MAX_PER_KEYFRAME:
+            return
+        rows = rows[np.argsort(self._number[rows])]
+        by_sigma = np.argsort(self._table.sigma[rows], kind="stable")
+        self._keyframe[rows[by_sigma[_MAX_PER_KEYFRAME:]]] = _FREE
 
     def has_features(self, keyframe_ids: I64) -> NDArray[np.bool_]:
         """Return which keyframes (K,) have dormant features."""
@@ -102,27 +113,31 @@ class DormantFeatures:
         (distance,), (angle,) = se3.pairwise_distances(state.T[None], state.keyframe_poses)
         is_near = (distance < _MAX_DISTANCE_M) & (angle < _MAX_ANGLE_RAD)
         nearest = np.argsort(distance + angle, kind="stable")
-        rows, anchor = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-        for k in nearest[is_near[nearest]].tolist():
-            candidates = self._most_certain(int(state.keyframe_ids[k]))
-            if self._table is None or not len(candidates):
-                continue
-            ray, rho = self._table.ray[candidates], self._table.rho[candidates]
-            rows.append(candidates[feature_matching.is_in_view(state, camera, k, ray, rho)])
-            anchor.append(np.full(len(rows[-1]), k))
-            if sum(map(len, rows)) >= _MAX_SEARCHED:
-                break
-        found = np.concatenate(rows)
-        if self._table is None or not len(found):
+        nearest = nearest[is_near[nearest]]
+        rows, rank = np.nonzero(self._keyframe[:, None] == state.keyframe_ids[nearest])
+        if self._table is None or not len(rows):
             return None
-        return replace(self._table.take(found), anchor=np.concatenate(anchor))
+        order = np.lexsort((self._number[rows], rank))
+        rows, rank = rows[order], rank[order]
+        ray, rho = self._table.ray[rows], self._table.rho[rows]
+        in_view = feature_matching.is_in_view(state, camera, nearest[rank], ray, rho)
+        rows, rank = rows[in_view], rank[in_view]
+        if not len(rows):
+            return None
+        # Keyframes that come when there are enough already are left out.
+        is_searched = rank <= rank[min(_MAX_SEARCHED, len(rank)) - 1]
+        return replace(self._table.take(rows[is_searched]), anchor=nearest[rank[is_searched]])
 
-    def _most_certain(self, keyframe_id: int) -> I64:
-        """Return the rows of the most certain features of one keyframe, oldest first; free the others."""
-        rows = np.flatnonzero(self._keyframe == keyframe_id)
-        rows = rows[np.argsort(self._number[rows])]
-        if self._table is not None and len(rows) > _MAX_PER_KEYFRAME:
-            by_sigma = np.argsort(self._table.sigma[rows], kind="stable")
-            self._keyframe[rows[by_sigma[_MAX_PER_KEYFRAME:]]] = _FREE
-            rows = rows[np.sort(by_sigma[:_MAX_PER_KEYFRAME])]
-        return rows
+
+def nis(state: FilterState, rows: filter.FeatureMeasurements, rho_sigma: F64) -> F64:
+    """Return the NIS (M,) of measurements of dormant features, which the state does not have: their inverse
+    depths err by rho_sigma (M,) 1/m, independently."""
+    M = len(rows.feature)
+    columns = np.empty((M, CORE_SIZE + 6), np.int64)
+    columns[:, :CORE_SIZE] = np.arange(CORE_SIZE)
+    columns[:, CORE_SIZE:] = KEYFRAMES_START + 6 * rows.anchor[:, None] + np.arange(6)
+    H = np.concatenate([rows.H_core, rows.H_anchor], axis=2)
+    S = H @ state.cov[columns[:, :, None], columns[:, None, :]] @ H.swapaxes(1, 2)
+    S += rows.H_rho[:, :, None] * rows.H_rho[:, None, :] * (rho_sigma**2)[:, None, None]
+    S += (rows.sigma**2 + rows.correlated_sigma**2)[:, None, None] * np.eye(2)
+    return filter.residual_nis(rows.residual, S[:, 0, 0], S[:, 0, 1], S[:, 1, 1])

@@ -59,15 +59,15 @@ class FeatureMatches:
 
 
 def match_features(
-    frame: Frame, rig: Rig, state: FilterState, appearance: Appearance, start: int = 0
+    frame: Frame, rig: Rig, state: FilterState, appearance: Appearance, cam0_only: bool = False
 ) -> FeatureMatches:
-    """Match the features from index `start` on in the images of a frame, both in one pass; in cam1 only those
-    that are due."""
+    """Match the features in the images of a frame, both in one pass; in cam1 only those that are due. The
+    covariance is not used."""
     n = len(state.feature_ids)
-    indices = np.arange(start, n)
+    indices = np.arange(n)
     images: tuple[U8, ...] = (frame.image0,)
     cameras, cam0_count = [rig.cam0], len(indices)
-    if frame.image1 is not None and rig.cam1 is not None and not start:
+    if frame.image1 is not None and rig.cam1 is not None and not cam0_only:
         images, cameras = (frame.image0, frame.image1), [rig.cam0, rig.cam1]
         indices = np.concatenate([indices, np.flatnonzero(is_stereo_due(appearance))])
     is_in_cam1 = np.arange(len(indices)) >= cam0_count
@@ -84,7 +84,7 @@ def match_features(
     )
     to_align = np.flatnonzero(inside)
     cam0_patch = PatchPrediction(patch.uv[:cam0_count], patch.warp[:cam0_count], patch.J_rho[:cam0_count])
-    out = _no_matches(n, indices[:cam0_count], expected[:cam0_count], cam0_patch, warp[:cam0_count])
+    out = _no_matches(expected[:cam0_count], cam0_patch, warp[:cam0_count])
     if len(to_align) == 0:
         return out
     cam0_to_align = int(np.searchsorted(to_align, cam0_count))
@@ -148,24 +148,15 @@ def match_by_flow(
     _store(matches, missing, aligned, start_px, accepted, slice(None))
 
 
-def _no_matches(n: int, indices: I64, predicted_px: F64, patch: PatchPrediction, warp: F64) -> FeatureMatches:
-    """Return matches of n features, none found yet; `indices` (M,) have a prediction."""
-    all_px, uv, px_per_rho = predicted_px, patch.uv, _px_per_rho(patch)
-    if len(indices) < n:
-        all_px, uv, px_per_rho = (
-            _scatter(value, indices, np.full((n, 2), np.nan)) for value in (all_px, uv, px_per_rho)
-        )
-        warp = _scatter(warp, indices, np.zeros((n, 2, 2)))
+def _no_matches(predicted_px: F64, patch: PatchPrediction, warp: F64) -> FeatureMatches:
+    """Return matches of the predicted features (N,), none found yet."""
+    n = len(predicted_px)
     none, samples = np.zeros(n, bool), np.zeros((n, len(patches.OFFSETS)), np.float32)
-    px = np.where(np.isnan(all_px), -1e6, all_px).astype(np.float32)
+    px = np.where(np.isnan(predicted_px), -1e6, predicted_px).astype(np.float32)
+    at = np.full((n, 2), np.nan)
     return FeatureMatches(
-        px, np.full((n, 2), np.nan), none, none.copy(), all_px, uv, warp, px_per_rho, samples
+        px, at, none, none.copy(), predicted_px, patch.uv, warp, _px_per_rho(patch), samples
     )
-
-
-def _scatter(values: F64, indices: I64, out: F64) -> F64:
-    out[indices] = values
-    return out
 
 
 def _solved(J: F64, b: F64) -> F64:
@@ -321,18 +312,21 @@ def _project_with_jacobians(
     return uv, D, J_rho
 
 
-def is_in_view(
-    state: FilterState, camera: Camera, keyframe_index: int, ray: F64, rho: F64
-) -> NDArray[np.bool_]:
-    """Return which points (N,) on rays (N, 2) of keyframe `keyframe_index`, at inverse depths (N,), are in
-    cam0's view."""
-    T = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses[keyframe_index] @ state.T_body_cam
-    uv, _ = project(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
+def is_in_view(state: FilterState, camera: Camera, anchor: I64, ray: F64, rho: F64) -> NDArray[np.bool_]:
+    """Return which points (N,) on rays (N, 2) of the keyframes with indices `anchor` (N,), at inverse depths
+    (N,), are in cam0's view."""
+    T = _keyframes_in_camera(state)[anchor]
+    uv, _ = project((T[:, :3, :3] @ rays(ray)[:, :, None])[:, :, 0] + rho[:, None] * T[:, :3, 3])
     return np.asarray(camera.is_inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)
 
 
 def anchors_in_camera(state: FilterState, indices: I64 | slice = slice(None)) -> F64:
     """Return T_cam_anchor (N, 4, 4): from cam0 of the anchor of each feature in `indices` to cam0 now."""
-    T_cam_anchor = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
-    out: F64 = T_cam_anchor[state.anchor[indices]]
+    out: F64 = _keyframes_in_camera(state)[state.anchor[indices]]
+    return out
+
+
+def _keyframes_in_camera(state: FilterState) -> F64:
+    """Return T_cam_keyframe (K, 4, 4): from cam0 of each keyframe to cam0 now."""
+    out: F64 = se3.inverse(state.T @ state.T_body_cam) @ state.keyframe_poses @ state.T_body_cam
     return out

@@ -201,9 +201,13 @@ def nis(rows: FeatureMeasurements, S: FloatArray) -> F64:
     predicted."""
     M = len(rows.feature)
     a, b = 2 * np.arange(M), 2 * np.arange(M) + 1
-    x, y = rows.residual.T
     inflation = (CORRELATION_INFLATION - 1) * rows.correlated_sigma**2  # a single error is not inflated
-    sxx, sxy, syy = S[a, a] - inflation, S[a, b], S[b, b] - inflation
+    return residual_nis(rows.residual, S[a, a] - inflation, S[a, b], S[b, b] - inflation)
+
+
+def residual_nis(residual: F64, sxx: FloatArray, sxy: FloatArray, syy: FloatArray) -> F64:
+    """Return the NIS (M,) of residuals (M, 2) with covariances [[sxx, sxy], [sxy, syy]], each (M,)."""
+    x, y = residual.T
     distance = (syy * x * x - 2 * sxy * x * y + sxx * y * y) / (sxx * syy - sxy * sxy)
     out: F64 = np.where(np.isfinite(distance), distance, np.inf)
     return out

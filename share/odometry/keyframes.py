@@ -24,6 +24,7 @@ from share.odometry.landmarks import LandmarkMap
 from share.odometry.relocalisation import POSE_COV
 from share.odometry.state import FilterState
 from share.types import F32, F64, Frame
+from share.vision.corners import CornerPeaks
 from share.vision.keyframe_images import Surfaces
 
 KEYFRAME_GAP_NS = 100_000_000  # least time between keyframes
@@ -121,12 +122,14 @@ class OfferedKeyframe(NamedTuple):
 class _PendingKeyframe:
     """A keyframe with work left.
 
-    occupied_px (N, 2): positions near which no new feature is searched. corners: of new features.
+    occupied_px (N, 2): positions near which no new feature is searched. peaks: candidates for corners.
+    corners: of new features.
     """
 
     frame: Frame
     keyframe_id: int
     occupied_px: F32
+    peaks: CornerPeaks
     corners: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
 
@@ -173,12 +176,17 @@ class KeyframeWork:
         if frame.stamp_ns != self._spacing.stamp_ns:
             keyframe_id = landmarks.add_keyframe(rate)
             self._spacing.stamp_ns, self._spacing.T = frame.stamp_ns, landmarks.state.T
-            pending = self._newest = _PendingKeyframe(frame, keyframe_id, landmarks.occupied_px())
-            steps: Slice = [
-                (step, pending) for step in (self._reactivate, self._find_corners, self._add_features)
+            pending = self._newest = _PendingKeyframe(
+                frame, keyframe_id, landmarks.occupied_px(), CornerPeaks(frame.image0)
+            )
+            slices: list[Slice] = [
+                [(self._reactivate, pending), (self._find_peaks, pending)],
+                [(self._find_corners, pending)],
+                [(self._add_features, pending)],
             ]
+            steps = [step for group in slices for step in group]
             if not urgent:
-                self._slices.extend([step] for step in steps)
+                self._slices.extend(slices)
             elif self._slices:
                 self._slices[0][:0] = steps
             else:
@@ -260,10 +268,16 @@ class KeyframeWork:
         pending.occupied_px = np.concatenate([pending.occupied_px, reactivated_px])
         landmarks.drop_keyframes((self._last_published.keyframe_id,))
 
+    def _find_peaks(
+        self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
+    ) -> None:
+        if landmarks.has_free_slots():
+            pending.peaks.find_half()
+
     def _find_corners(
         self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
     ) -> None:
-        pending.corners = landmarks.find_corners(pending.frame, pending.occupied_px)
+        pending.corners = landmarks.find_corners(pending.frame, pending.occupied_px, pending.peaks)
 
     def _add_features(
         self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64

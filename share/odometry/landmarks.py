@@ -11,14 +11,21 @@ from numpy.typing import NDArray
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.odometry import feature_appearance, feature_matching, filter, initial_depth, state
-from share.odometry.dormant_features import DormantFeatures
+from share.odometry import (
+    dormant_features,
+    feature_appearance,
+    feature_matching,
+    filter,
+    initial_depth,
+    state,
+)
+from share.odometry.dormant_features import DormantFeatures, DormantTable
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches, Prediction
 from share.odometry.state import GYRO_BIAS, FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
-from share.vision.corners import field_mask
+from share.vision.corners import CornerPeaks, field_mask
 from share.vision.depth import MIN_RHO
 from share.vision.keyframe_images import Surfaces
 from share.vision.orb import measures_depth
@@ -158,7 +165,7 @@ class LandmarkMap:
 
     def cam0_measurements(self, uv: F64, indices: I64, rate: F64) -> filter.FeatureMeasurements:
         """Return measurements of features `indices` (M,) at uv (N, 2) of all in cam0."""
-        return self._measurements(indices, uv[indices], None, rate)
+        return self._measurements(self.state, indices, uv[indices], None, rate)
 
     def frame_measurements(self, matches: FeatureMatches, rate: F64) -> filter.FeatureMeasurements:
         """Return measurements of all static matches of a frame, in both cameras, sorted by anchor, by the
@@ -175,24 +182,25 @@ class LandmarkMap:
         order = np.argsort(self.state.anchor[indices], kind="stable")
         in_cam1 = None if in_cam1 is None else in_cam1[order]
         return self._with_inflated_noise(
-            self._measurements(indices[order], measured_uv[order], in_cam1, rate)
+            self._measurements(self.state, indices[order], measured_uv[order], in_cam1, rate)
         )
 
     def _measurements(
-        self, indices: I64, uv: F64, in_cam1: NDArray[np.bool_] | None, rate: F64
+        self, s: FilterState, indices: I64, uv: F64, in_cam1: NDArray[np.bool_] | None, rate: F64
     ) -> filter.FeatureMeasurements:
-        """Return measurements of features `indices` (M,) at uv (M, 2), in cam1 where in_cam1 (M,) is True."""
+        """Return measurements of features `indices` (M,) of a state at uv (M, 2), in cam1 where in_cam1 (M,)
+        is True."""
         T = None if in_cam1 is None else self._rig.T_cam1_cam0
         focal = np.full(len(indices), self._rig.cam0.focal)
         if in_cam1 is not None and self._rig.cam1 is not None:
             focal[in_cam1] = self._rig.cam1.focal
-        predicted = feature_matching.predict(self.state, indices, T, in_cam1)
+        predicted = feature_matching.predict(s, indices, T, in_cam1)
         if self._rig.cam0.is_fisheye:
             predicted, uv = self._in_image_plane(
                 predicted, uv, np.zeros(len(indices), bool) if in_cam1 is None else in_cam1
             )
         sigma, correlated_sigma = self.sigma_px / focal, LASTING_PX / focal
-        return filter.feature_measurements(self.state, indices, predicted, uv, sigma, correlated_sigma, rate)
+        return filter.feature_measurements(s, indices, predicted, uv, sigma, correlated_sigma, rate)
 
     def _in_image_plane(
         self, predicted: Prediction, uv: F64, in_cam1: NDArray[np.bool_]
@@ -243,11 +251,16 @@ class LandmarkMap:
         """Return px (M, 2) in the frame just tracked, near which no new feature is searched."""
         return np.concatenate([self.appearance.last_px, *self._avoided_px])
 
-    def find_corners(self, frame: Frame, occupied_px: F32) -> F32:
+    def find_corners(self, frame: Frame, occupied_px: F32, peaks: CornerPeaks | None = None) -> F32:
         """Return px (N, 2) of corners for new features of a keyframe, away from occupied_px (M, 2), best
-        first."""
-        max_count = self._config.features if self._free_slots() else 0
-        return corners.detect(frame.image0, occupied_px, max_count, _SPACING_PX, field_mask(self._rig.cam0))
+        first; peaks: of its image, if some are known."""
+        max_count = self._config.features if self.has_free_slots() else 0
+        mask = field_mask(self._rig.cam0)
+        return corners.detect(frame.image0, occupied_px, max_count, _SPACING_PX, mask, peaks)
+
+    def has_free_slots(self) -> bool:
+        """Return whether features may be added."""
+        return self._free_slots() > 0
 
     def admit_features(self, frame: Frame, keyframe_id: int, px: F32) -> None:
         """Add features at px (N, 2) of `frame`, the keyframe with this id; the last frame may be a later
@@ -288,28 +301,27 @@ class LandmarkMap:
     def reactivate(self, frame: Frame, rate: F64) -> F32:
         """Reactivate dormant features where the frame just tracked shows them within the gate. Return
         their px (M, 2)."""
-        s, old_count = self.state, len(self.state.feature_ids)
+        s = self.state
         dormant = self._dormant.nearby(s, self._rig.cam0)
         if dormant is None:
             return np.zeros((0, 2), np.float32)
-        state.add_features(s, dormant.ids, dormant.anchor, dormant.ray, dormant.rho, dormant.sigma)
-        self.appearance = self.appearance.concatenate(dormant.appearance)
-        recognised = self._is_recognised(frame, rate, old_count)
-        self._dormant.reactivate(s.feature_ids[recognised][old_count:])
-        self.keep_features(recognised)
-        return self.appearance.last_px[old_count:]
+        known = self._recognised(dormant, frame, rate)
+        state.add_features(s, known.ids, known.anchor, known.ray, known.rho, known.sigma)
+        self.appearance = self.appearance.concatenate(known.appearance)
+        self._dormant.reactivate(known.ids)
+        return known.appearance.last_px
 
-    def _is_recognised(self, frame: Frame, rate: F64, start: int) -> NDArray[np.bool_]:
-        """Return True for features before index `start`, and for the others that are found within the
-        gate."""
-        matches = feature_matching.match_features(frame, self._rig, self.state, self.appearance, start)
-        self.appearance.last_px[matches.is_found] = matches.px[matches.is_found]
-        rows = self.cam0_measurements(matches.at, np.flatnonzero(matches.is_found), rate)
-        recognised = np.arange(len(self.state.feature_ids)) < start
-        if len(rows.feature):
-            _, S = filter.innovation_covariance(self.state, rows)
-            recognised[rows.feature[filter.nis(rows, S) < filter.GATE]] = True
-        return recognised
+    def _recognised(self, dormant: DormantTable, frame: Frame, rate: F64) -> DormantTable:
+        """Return the dormant features that are found within the gate, with their place in the frame."""
+        means = replace(
+            self.state, feature_ids=dormant.ids, anchor=dormant.anchor, ray=dormant.ray, rho=dormant.rho
+        )
+        matches = feature_matching.match_features(frame, self._rig, means, dormant.appearance, cam0_only=True)
+        found = np.flatnonzero(matches.is_found)
+        rows = self._measurements(means, found, matches.at[found], None, rate)
+        recognised = found[dormant_features.nis(self.state, rows, dormant.sigma[found]) < filter.GATE]
+        dormant.appearance.last_px[recognised] = matches.px[recognised]
+        return dormant.take(recognised)
 
     def keep_features(self, keep: NDArray[np.bool_]) -> None:
         """Drop the features where keep (N,) is False."""
@@ -327,7 +339,7 @@ class LandmarkMap:
         Never the newest two, nor those in `held_ids`, between which motions are published.
         """
         s = self.state
-        is_active = np.isin(np.arange(len(s.keyframe_ids)), s.anchor)
+        is_active = np.bincount(s.anchor, minlength=len(s.keyframe_ids)) > 0
         dropped = ~is_active & ~self._dormant.has_features(s.keyframe_ids)
         is_held = np.isin(s.keyframe_ids, held_ids)
         is_held[-2:] = True
@@ -345,7 +357,8 @@ class LandmarkMap:
         if not dropped.any():
             return
         self._dormant.drop_keyframes(s.keyframe_ids[dropped])
-        self.appearance = self.appearance.take(~dropped[s.anchor])
+        if (is_active & dropped).any():
+            self.appearance = self.appearance.take(~dropped[s.anchor])
         state.drop_keyframes(s, s.keyframe_ids[dropped])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import lru_cache
 
 import cv2
@@ -16,21 +17,30 @@ _BLOCK_PX = 5
 _MIN_EIGENVALUE = 4e-4  # above the noise of an image
 _SUPPRESSION_PX = 9  # window in which only the strongest corner is kept
 _BORDER_PX = 6
+_BANDS = 4
+_BAND_MARGIN_PX = 8  # rows beyond a band on which its corners depend
 _FAST_CONTRAST = 12
 GRID = (8, 6)  # cells across and down, over which features are spread
 
 
-def detect(image: U8, occupied_px: F32, count: int, spacing: float, mask: U8 | None = None) -> F32:
+def detect(
+    image: U8,
+    occupied_px: F32,
+    count: int,
+    spacing: float,
+    mask: U8 | None = None,
+    peaks: CornerPeaks | None = None,
+) -> F32:
     """Return up to `count` new corners (N, 2) px, at least `spacing` px from each other and from occupied_px
     (M, 2).
 
-    mask (H, W): 255 where corners may be. Minimum-eigenvalue corners (Shi and Tomasi 1994), with subpixel
-    refinement. Cells with few points come first, so that a poster does not take all corners; those in
-    `occupied_px` count.
+    mask (H, W): 255 where corners may be. peaks: of this image, if some are known. Minimum-eigenvalue corners
+    (Shi and Tomasi 1994), with subpixel refinement. Cells with few points come first, so that a poster does
+    not take all corners; those in `occupied_px` count.
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)
-    px, strength = _peaks(image)
+    px, strength = (peaks or CornerPeaks(image)).px_and_strength()
     if mask is not None:
         px, strength = _masked(px, strength, mask)
     order = spread_order(px, strength, image.shape[::-1], GRID, occupied_px)
@@ -70,16 +80,40 @@ def _refined(image: U8, px: NDArray[np.generic]) -> F32:
     return out
 
 
-def _peaks(image: U8) -> tuple[I64, F32]:
-    """Return corners (N, 2) px that are local maxima, and their strength (N,)."""
-    strength = cv2.cornerMinEigenVal(image, _BLOCK_PX)
+class CornerPeaks:
+    """Corners of an image that are local maxima of their strength. They are found in bands of rows, which the
+    processor's cache can hold."""
+
+    def __init__(self, image: U8) -> None:
+        bounds = np.linspace(0, len(image), _BANDS + 1).astype(int).tolist()
+        self._image, self._bands = image, list(itertools.pairwise(bounds))
+        self._found: list[tuple[I64, F32]] = []
+
+    def find_half(self) -> None:
+        """Find those of half of the image, if they are not all found."""
+        for _ in range(_BANDS // 2):
+            if self._bands:
+                self._found.append(_peaks(self._image, *self._bands.pop(0)))
+
+    def px_and_strength(self) -> tuple[I64, F32]:
+        """Return px (N, 2), row by row, and strength (N,) in the whole image."""
+        while self._bands:
+            self.find_half()
+        px, strength = zip(*self._found, strict=True)
+        return np.concatenate(px), np.concatenate(strength)
+
+
+def _peaks(image: U8, first: int, end: int) -> tuple[I64, F32]:
+    """Return corners (N, 2) px in rows [first, end) that are local maxima, and their strength (N,)."""
+    above, below = max(first - _BAND_MARGIN_PX, 0), min(end + _BAND_MARGIN_PX, len(image))
+    strength = cv2.cornerMinEigenVal(image[above:below], _BLOCK_PX)
     local_max = cv2.dilate(strength, np.ones((_SUPPRESSION_PX, _SUPPRESSION_PX), np.uint8))
-    peak = cv2.compare(strength, local_max, cv2.CMP_EQ)
-    peak &= cv2.compare(strength, _MIN_EIGENVALUE, cv2.CMP_GT)
-    peak[:_BORDER_PX] = peak[-_BORDER_PX:] = peak[:, :_BORDER_PX] = peak[:, -_BORDER_PX:] = 0
-    found = cv2.findNonZero(peak)  # five times as fast as np.nonzero
-    px = np.zeros((0, 2), np.int64) if found is None else found.reshape(-1, 2).astype(np.int64)
-    return px, strength[px[:, 1], px[:, 0]]
+    rows = slice(max(first, _BORDER_PX) - above, min(end, len(image) - _BORDER_PX) - above)
+    inside = rows, slice(_BORDER_PX, image.shape[1] - _BORDER_PX)
+    strength, local_max = strength[inside], local_max[inside]
+    is_peak = (strength == local_max) & (strength > _MIN_EIGENVALUE)
+    y, x = np.divmod(np.flatnonzero(is_peak), max(strength.shape[1], 1))  # faster than np.nonzero
+    return np.column_stack([x + _BORDER_PX, y + (rows.start + above)]), strength[y, x]
 
 
 def _spaced(px: I64, occupied_px: F32, count: int, spacing: float, shape: tuple[int, ...]) -> I64:

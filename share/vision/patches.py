@@ -8,6 +8,7 @@ as predicted, so that only a shift is estimated. It is invariant to gain and bia
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -204,9 +205,16 @@ def sample(image: U8, x: F32, y: F32) -> F32:
 
 def sample_square(image: U8, px: F32, half: int) -> F32:
     """Return bilinear gray levels (N, (2 half + 1)^2) round px (N, 2), row by row."""
+    dx, dy = _square_offsets(half)
+    return sample(image, px[:, :1] + dx, px[:, 1:] + dy)
+
+
+@lru_cache(maxsize=8)
+def _square_offsets(half: int) -> tuple[F32, F32]:
+    """Return x and y ((2 half + 1)^2,) px of the places in a square, row by row."""
     axis = np.arange(-half, half + 1, dtype=np.float32)
     dx, dy = np.meshgrid(axis, axis)
-    return sample(image, px[:, :1] + dx.ravel(), px[:, 1:] + dy.ravel())
+    return dx.ravel(), dy.ravel()
 
 
 def _normalised(gray: F32) -> tuple[F32, F32]:

@@ -8,7 +8,7 @@ import pytest
 from helpers.imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
 from share.geometry import se3
-from share.odometry import feature_matching, filter
+from share.odometry import dormant_features, feature_matching, filter
 from share.odometry import state as filter_state
 from share.odometry.imu_propagation import integrate
 from share.odometry.state import CORE_SIZE, TIMESHIFT, initial_state
@@ -111,6 +111,20 @@ def test_correlated_noise_is_shared_by_both_cameras(state):
     same = (rows.feature[:, None] == rows.feature)[:, None, :, None] * np.eye(2)[:, None, :]
     shared = filter.CORRELATION_INFLATION * 0.3**2 * same.reshape(alone.shape)
     assert np.allclose(together - alone, shared, atol=1e-14)
+
+
+def test_nis_of_features_outside_the_state_is_that_in_it(state):
+    """As a dormant feature is gated before it is reactivated."""
+    grown, rng, rate = copy.deepcopy(state), np.random.default_rng(8), np.array([0.2, 0.1, -0.3])
+    sigma = np.array([0.01, 0.02, 0.05])
+    ids, anchor = np.arange(100, 103), np.array([1, 0, 1])
+    filter_state.add_features(grown, ids, anchor, rng.uniform(-0.2, 0.2, (3, 2)), np.full(3, 0.3), sigma)
+    which = np.arange(10, 13)
+    seen = feature_matching.predict(grown, which)
+    uv = seen.uv + rng.normal(0, 0.01, (3, 2))
+    rows = filter.feature_measurements(grown, which, seen, uv, np.full(3, 1e-3), np.full(3, 2e-3), rate)
+    _, S = filter.innovation_covariance(grown, rows, double_precision=True)
+    assert np.allclose(dormant_features.nis(state, rows, sigma), filter.nis(rows, S), rtol=1e-9)
 
 
 def numeric_cov(state, motion):

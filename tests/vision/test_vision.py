@@ -53,6 +53,20 @@ def test_a_bright_poster_does_not_take_all_corners():
     assert on_poster[1] > 0.5
 
 
+def test_corners_found_in_bands_are_those_of_the_whole_image():
+    rng = np.random.default_rng(4)
+    image = cv2.GaussianBlur(rng.integers(0, 255, (239, 320), np.uint8), (0, 0), 1.5)
+    peaks = corners.CornerPeaks(image)
+    peaks.find_half()
+    px, strength = peaks.px_and_strength()
+    whole = cv2.cornerMinEigenVal(image, 5)
+    expected = (whole == cv2.dilate(whole, np.ones((9, 9), np.uint8))) & (whole > 4e-4)
+    expected[:6] = expected[-6:] = expected[:, :6] = expected[:, -6:] = False
+    assert len(px) > 100
+    assert (px[:, ::-1] == np.argwhere(expected)).all()
+    assert np.allclose(strength, whole[expected], rtol=1e-5)
+
+
 def test_no_corners_on_a_blank_wall():
     blank = np.full((480, 640), 128, np.uint8)
     for detect in (corners.detect, corners.strongest):
