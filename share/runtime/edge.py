@@ -342,7 +342,8 @@ class EdgeRun:
 
     def _execute(self, effect: EdgeEffect) -> None:
         if isinstance(effect, WriteEvent):
-            if (fields := self._blinding.covered_event(effect.fields)) is None:
+            fields = self._blinding.covered_event(effect.fields)
+            if fields is None:
                 return
             effect = WriteEvent(fields)
         self._observer.add_effect(effect)
