@@ -56,7 +56,7 @@ class Blinding:
 
 
 class NoBlinding:
-    """Covers nothing: for an edge outside a blind study."""
+    """Covers nothing: of an edge that is in no study."""
 
     def covered(self, report: dict[str, Any]) -> dict[str, Any]:
         return report
@@ -64,7 +64,7 @@ class NoBlinding:
     def covered_event(self, fields: dict[str, Any]) -> dict[str, Any] | None:
         return fields
 
-    def covered_series(self, series: dict[str, Any]) -> dict[str, Any]:
+    def covered_series(self, series: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
         return series
 
 

@@ -39,7 +39,7 @@ _STALE_REPORT_S = 1.0  # age from which a report is declared stale
 
 class EdgeRun:
     """One run of the edge, until `stop`. Writes events.jsonl as events happen and edge.json at the end to
-    `out`. allowed: what every client may do where no keys say it. blinding: of a study."""
+    `out`. allowed: rights of every client of an edge without keys. blinding: of a study."""
 
     def __init__(
         self,

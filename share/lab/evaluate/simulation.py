@@ -19,7 +19,7 @@ import numpy as np
 
 from share.config import Config
 from share.lab.evaluate.emulated_network import Channel, NetworkModel
-from share.lab.evaluate.processing_delays import MS_NS, Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import MS_NS, Delay, MeasuredDelay, ProcessingDelays
 from share.lab.evaluate.shared_air import SharedAir
 from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
@@ -135,7 +135,7 @@ class Simulation:
     def _schedule(self, delay_ns: int, action: Callable[[], None]) -> None:
         heapq.heappush(self._events, (self.now_ns + delay_ns, next(self._order), action))
 
-    def _draw(self, cost: Delay | Sampled) -> int:
+    def _draw(self, cost: Delay | MeasuredDelay) -> int:
         return cost.draw_ns(next(self._random_normals))
 
     def _tick(self) -> None:

@@ -25,7 +25,7 @@ from share.files.writing import atomic_write, writable_dir
 from share.files.yaml_file import read_settings
 from share.geometry.camera import Rig
 from share.lab.evaluate.emulated_network import LinkAssignment, NetworkModel
-from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import Delay, MeasuredDelay, ProcessingDelays
 from share.lab.evaluate.real_time import MapMembership, Progress, RunOptions
 from share.lab.evaluate.simulation import Simulation, TrackedFrame
 from share.lab.evaluate.tracker_runs import strict_tracker
@@ -286,5 +286,9 @@ def _scaled(cost: Delay, factor: float) -> Delay:
     return Delay(factor * cost.p50, factor * cost.p95)
 
 
-def _slower(cost: Delay | Sampled, factor: float) -> Delay | Sampled:
-    return _scaled(cost, factor) if isinstance(cost, Delay) else Sampled(tuple(factor * ms for ms in cost.ms))
+def _slower(cost: Delay | MeasuredDelay, factor: float) -> Delay | MeasuredDelay:
+    return (
+        _scaled(cost, factor)
+        if isinstance(cost, Delay)
+        else MeasuredDelay(tuple(factor * ms for ms in cost.ms))
+    )

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import DataError, ShareError, UsageError
-from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import Delay, MeasuredDelay, ProcessingDelays
 from share.lab.evaluate.virtual_time import read_delays
 
 
@@ -40,7 +40,7 @@ def test_unmeasured_delays_are_in_proportion_to_measured_ones(tmp_path):
     assert costs.solve == Delay(20.0, 50.0)
     slower = 20.0 / usual.frame.p50
     assert costs.keyframe == Delay(slower * usual.keyframe.p50, slower * usual.keyframe.p95)
-    assert costs.finish_keyframe == Sampled(tuple(slower * ms for ms in usual.finish_keyframe.ms))
+    assert costs.finish_keyframe == MeasuredDelay(tuple(slower * ms for ms in usual.finish_keyframe.ms))
     for name in ("receive", "add", "check_loop", "apply_solution"):
         assert getattr(costs, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
 

@@ -13,7 +13,7 @@ from helpers.room_simulation import MS, tracked_frames
 from share.config import Config, EdgeConfig
 from share.geometry.camera import Camera
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS, NetworkModel
-from share.lab.evaluate.processing_delays import Delay, ProcessingDelays, Sampled
+from share.lab.evaluate.processing_delays import Delay, MeasuredDelay, ProcessingDelays
 from share.lab.evaluate.simulation import Simulation
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
@@ -76,7 +76,7 @@ def test_a_delay_has_its_median_and_95th_percentile() -> None:
 
 def test_a_sampled_delay_has_the_measured_quantiles() -> None:
     rng = np.random.default_rng(0)
-    measured = Sampled((0.0, 0.0, 0.0, 2.0, 5.0))
+    measured = MeasuredDelay((0.0, 0.0, 0.0, 2.0, 5.0))
     drawn = np.array([measured.draw_ns(x) for x in rng.standard_normal(20_000)]) / MS
     assert np.percentile(drawn, [0, 25, 50, 75, 100]) == pytest.approx([0, 0, 0, 2, 5], abs=0.06)
 
@@ -94,7 +94,8 @@ def test_agents_of_one_access_point_share_its_air() -> None:
 
 def test_keyframe_work_after_a_frame_delays_the_next_one() -> None:
     none, always = (
-        world(seconds=3.0, frame=Delay(5.0, 5.0), finish_keyframe=Sampled((ms,) * 2)) for ms in (0.0, 80.0)
+        world(seconds=3.0, frame=Delay(5.0, 5.0), finish_keyframe=MeasuredDelay((ms,) * 2))
+        for ms in (0.0, 80.0)
     )
     assert max(track_ms(none, "ann")) < 5.1
     waits = np.diff(track_ms(always, "ann"))
