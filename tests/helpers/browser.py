@@ -36,11 +36,15 @@ _EMULATED = """
     device.position.set(0, 1.6, 0);
     window.headset = device;
     window.move = null;  // moves it, just before each frame
+    let movedMs = 0;
     const step = () => {
         requestAnimationFrame(step);
-        window.move?.(performance.timeOrigin + performance.now());
+        movedMs = performance.now();
+        window.move?.(performance.timeOrigin + movedMs);
     };
     requestAnimationFrame(step);
+    // Frames are of when it was moved: on a busy machine tens of milliseconds may pass until one begins.
+    Object.defineProperty(XRFrame.prototype, "predictedDisplayTime", { get: () => movedMs });
 })();
 """
 
@@ -65,6 +69,7 @@ class BrowserPage:
     def __init__(self, endpoint: str) -> None:
         self._connection, self._number = _connect(endpoint), 0
         self.problems = list[str]()
+        self._traced, self._is_traced = list[dict[str, Any]](), False
         for domain in ("Runtime", "Page", "Log"):
             self.call(f"{domain}.enable")
 
@@ -144,8 +149,24 @@ class BrowserPage:
     def picture(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
+    def begin_trace(self, *categories: str) -> None:
+        """Note events of all pages of the browser, with the CPU time of their threads."""
+        included = {"includedCategories": list(categories), "excludedCategories": ["*"]}
+        self.call("Tracing.start", traceConfig=included, transferMode="ReportEvents")
+
+    def end_trace(self) -> list[dict[str, Any]]:
+        self._traced, self._is_traced = [], False
+        self.call("Tracing.end")
+        while not self._is_traced:
+            self._note(json.loads(self._connection.recv(timeout=_CALL_S)))
+        return self._traced
+
     def _note(self, event: dict[str, Any]) -> None:
         match event.get("method"):
+            case "Tracing.dataCollected":
+                self._traced += event["params"]["value"]
+            case "Tracing.tracingComplete":
+                self._is_traced = True
             case "Runtime.exceptionThrown":
                 details = event["params"]["exceptionDetails"]
                 self.problems.append(details.get("exception", {}).get("description", details["text"]))
