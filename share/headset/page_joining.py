@@ -18,9 +18,10 @@ _INLINE = re.compile(rb"<(style|script)>(.*?)</\1>", re.DOTALL)
 _IMPORT = re.compile(r'^import (\{[\w, ]+\}) from "\./([\w-]+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:const|class|function) (\w+)(?![\w$]))", re.MULTILINE)
 _OTHER = re.compile(r"^\s*(?:import|export)\b.*|\bimport\.meta\b", re.MULTILINE)
-# What may hold a line that only looks like one of these; a string of one line, so that what is in it begins neither.
+# What may hold a line that only looks like one of these; strings of one line do not.
 _ASIDE = re.compile(
-    r"""//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|(/\*.*?(?:\*/|\Z)|`(?:\\.|[^`\\])*(?:`|\Z))""", re.DOTALL
+    r"""//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|(/\*.*?(?:\*/|\Z)|`(?:\\.|[^`\\])*(?:`|\Z))""",
+    re.DOTALL,
 )
 
 

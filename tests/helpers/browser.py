@@ -26,6 +26,7 @@ from websockets.sync.client import ClientConnection, connect
 
 IWER = "iwer@2.5.0"
 _CALL_S = 300.0  # on a busy machine
+_HEAP = {"code": "code", "object shape": "code", "native": "native"}  # what is no data of a page's scripts
 
 # A Quest 3 whose head, hands and recentering a test moves: `headset` is its device.
 _EMULATED = """
@@ -70,6 +71,7 @@ class BrowserPage:
         self._connection, self._number = _connect(endpoint), 0
         self.problems = list[str]()
         self._traced, self._is_traced = list[dict[str, Any]](), False
+        self._snapshot = list[str]()
         for domain in ("Runtime", "Page", "Log"):
             self.call(f"{domain}.enable")
 
@@ -161,8 +163,27 @@ class BrowserPage:
             self._note(json.loads(self._connection.recv(timeout=_CALL_S)))
         return self._traced
 
+    def heap_bytes(self) -> dict[str, int]:
+        """Return what lies on the heap of its scripts after collection: `data` (objects, arrays, texts,
+        numbers, closures), `code` (compiled, with shapes of objects), `native` (of the browser itself)."""
+        self._snapshot = []
+        for _ in range(2):
+            self.call("HeapProfiler.collectGarbage")
+        self.call("HeapProfiler.takeHeapSnapshot", reportProgress=False)
+        snapshot = json.loads("".join(self._snapshot))
+        about, nodes = snapshot["snapshot"]["meta"], snapshot["nodes"]
+        fields, kinds = about["node_fields"], about["node_types"][0]
+        types = nodes[fields.index("type") :: len(fields)]
+        sizes = nodes[fields.index("self_size") :: len(fields)]
+        found = {"data": 0, "code": 0, "native": 0}
+        for kind, size in zip(types, sizes, strict=True):
+            found[_HEAP.get(kinds[kind], "data")] += size
+        return found
+
     def _note(self, event: dict[str, Any]) -> None:
         match event.get("method"):
+            case "HeapProfiler.addHeapSnapshotChunk":
+                self._snapshot.append(event["params"]["chunk"])
             case "Tracing.dataCollected":
                 self._traced += event["params"]["value"]
             case "Tracing.tracingComplete":

@@ -1,5 +1,7 @@
-"""What a page takes in script, by the CPU time of its thread as the browser traces it: waits, as for WebGL that is drawn
-in software, and other processes are not in it; calls of WebGL are, tracing is too."""
+"""What a page takes in script, by the CPU time of its thread as the browser traces it.
+
+Waits, as for WebGL that is drawn in software, and other processes are not in it; calls of WebGL are.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ def mark_frames(page: BrowserPage) -> None:
 
 
 def script_cpu_ms(page: BrowserPage, work: Callable[[], None]) -> tuple[list[float], list[float]]:
-    """Return what each marked frame takes while some work is done, ms, and what else the page's script does: each
-    message and timer."""
+    """Return what each marked frame takes while some work is done, ms, and what else the page's script does:
+    each message and timer."""
     page.begin_trace("devtools.timeline")
     work()
     events = page.end_trace()
