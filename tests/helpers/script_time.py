@@ -32,7 +32,8 @@ def script_cpu_ms(page: BrowserPage, work: Callable[[], None]) -> tuple[list[flo
     page.begin_trace("devtools.timeline")
     work()
     events = page.end_trace()
-    began_us, frames, others = None, list[float](), list[float]()
+    began_us: float | None = None
+    frames, others = list[float](), list[float]()
     for event in sorted(events, key=lambda one: float(one["ts"])):
         data = event.get("args", {}).get("data", {})
         match event["name"], data.get("message"):
