@@ -18,6 +18,11 @@ _INLINE = re.compile(rb"<(style|script)>(.*?)</\1>", re.DOTALL)
 _IMPORT = re.compile(r'^import (\{[\w, ]+\}) from "\./([\w-]+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:const|class|function) (\w+)(?![\w$]))", re.MULTILINE)
 _OTHER = re.compile(r"^\s*(?:import|export)\b.*|\bimport\.meta\b", re.MULTILINE)
+# What may hold a line that only looks like one of these; strings of one line do not.
+_ASIDE = re.compile(
+    r"""//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|(/\*.*?(?:\*/|\Z)|`(?:\\.|[^`\\])*(?:`|\Z))""",
+    re.DOTALL,
+)
 
 
 def joined_html(html: str, files: Mapping[str, str]) -> str:
@@ -61,6 +66,9 @@ def _add_imported(name: str, files: Mapping[str, str], parts: dict[str, str], ab
 def _body(name: str, text: str, keeps_exports: bool) -> str:
     if text.startswith("\ufeff"):
         raise ValueError(f"{name}: cannot be joined: it begins with a byte order mark")
+    for aside in _ASIDE.findall(text):
+        if apparent := _OTHER.search(aside):
+            raise ValueError(f"{name}: cannot be joined: in a comment or text: {apparent[0].strip()[:100]}")
     text = _IMPORT.sub(lambda found: f"const {found[1].replace(' as ', ': ')} = {_variable(found[2])};", text)
     bare = _EXPORT.sub("", text)
     if other := _OTHER.search(bare):

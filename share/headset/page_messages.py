@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from share.errors import one_line
 from share.geometry import se3
 from share.types import F64
 from share.wire.room_messages import (
@@ -129,7 +130,7 @@ def decode_page(data: str | bytes) -> PageMessage:
             raise OtherSchemaError(
                 "this page is of another release than the edge: load it again in the browser"
             ) from None
-        raise MessageError(f"not a message of this page: {error}"[:300]) from None
+        raise MessageError(one_line(f"not a message of this page: {error}")[:300]) from None
     except (ValueError, RecursionError):
         raise MessageError("not a message of this page") from None
 

@@ -80,6 +80,27 @@ def test_what_would_be_undefined_is_said(text: str, reason: str) -> None:
         joined_module("one.js", {"one.js": 'import { a as c } from "./z.js";', "z.js": text})
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/* not yet:\nexport const b = 1;\n*/",
+        "const text = `\nexport const b = 1;\n`;",
+        '/*\nimport { b } from "./y.js";\n*/',
+        'const a1 = "/*"; /*\n  export const b = 1; */',
+    ],
+)
+def test_a_comment_exports_and_imports_nothing(text: str) -> None:
+    files = {
+        "x.js": 'import { a } from "./z.js";',
+        "y.js": "export const b = 1;",
+        "z.js": f"{text}\nexport const a = 1;",
+    }
+    with pytest.raises(ValueError, match=r"z\.js: cannot be joined: in a comment or text: (im|ex)port"):
+        joined_module("x.js", files)
+    aside = "// it's `so\nexport const a = 1; /* export\n it */\nexport const b = '/* `';\n"
+    assert joined_module("y.js", {"y.js": aside}) == aside
+
+
 def test_modules_with_names_alike_stay_apart() -> None:
     files = {
         "main.js": 'import { a } from "./a-b.js";\nimport { b } from "./a_b.js";\n',

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from helpers import emulated_wearer as worn
-from helpers.browser import Browser
+from helpers.browser import Browser, BrowserPage
 from helpers.headset_room import HeadsetRoom
+from helpers.script_time import mark_frames, script_cpu_ms
 
 from share.geometry import se3
 
@@ -116,15 +116,41 @@ def test_a_mount_that_is_two_degrees_wrong_is_said(chromium: Browser, room: Head
     worn.wait_until_said(page, "share calibrate headset")
 
 
-def test_script_time_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
+def sixteen_cubes(chromium: Browser, room: HeadsetRoom) -> BrowserPage:
     page = worn.wear(chromium, room.url, "ann")
     for k in range(16):
         room.put(100 + k, "cube", "ann", se3.from_rt(np.eye(3), np.array([1 + 0.3 * k, 1.0, -1])))
     page.wait("app.room.objects.size === 16 && app.place.mapId !== null")
-    page.wait("app.script.summary !== null && app.script.summary.frames > 60")
-    summary = page.app("app.script.summary")
-    print(f"script {summary['p50_ms']:.2f} ms a frame, 95 % {summary['p95_ms']:.2f} ms")
-    assert summary["p50_ms"] <= 2.0
+    return page
+
+
+def test_script_time_of_a_frame(chromium: Browser, room: HeadsetRoom) -> None:
+    page = sixteen_cubes(chromium, room)
+    mark_frames(page)
+    frames, others = script_cpu_ms(page, lambda: worn.wait_frames(page, 120))
+    whole = (sum(frames) + sum(others)) / len(frames)
+    print(
+        f"script {np.percentile(frames, [50, 95]).round(2)} ms a frame, {whole:.2f} with messages and timers"
+    )
+    assert len(frames) > 100 and np.median(frames) <= 2.0
+
+
+def test_a_frame_sets_no_state_that_is_set(chromium: Browser, room: HeadsetRoom) -> None:
+    page = sixteen_cubes(chromium, room)
+    page.app(
+        "(() => { calls = {}; const { gl, beginFrame } = app.renderer;"
+        " for (const name of ['drawArrays', 'drawArraysInstanced', 'depthMask', 'uniformMatrix4fv',"
+        " 'enable', 'disable']) { const call = gl[name]; calls[name] = 0;"
+        " gl[name] = (...values) => { calls[name]++; call.apply(gl, values); }; }"
+        " begun = 0; app.renderer.beginFrame = function (one) { begun++; beginFrame.call(this, one); }; })()"
+    )
+    worn.wait_frames(page, 10)
+    calls, begun = page.evaluate("[{ ...calls }, begun]")
+    draws = calls["drawArrays"] + calls["drawArraysInstanced"]
+    assert begun >= 10 and draws > 2 * 32 * begun  # a cube is drawn twice in each eye
+    assert draws < calls["uniformMatrix4fv"] <= draws + 12 * (begun + 1)
+    assert calls["depthMask"] < draws and calls["enable"] + calls["disable"] < 12 * (begun + 1)
+    assert page.problems == []
 
 
 def test_memory_does_not_grow(chromium: Browser, room: HeadsetRoom) -> None:
@@ -139,9 +165,9 @@ def test_memory_does_not_grow(chromium: Browser, room: HeadsetRoom) -> None:
         " const s = Math.sin((performance.now() - began) / 1000);"
         " aims = { ...aims, at: [0.6 - s, 0, -1.4 - 0.5 * s] }; }, 0)"
     )
-    heap = []
+    data_kb = []
     for _ in range(9):
         time.sleep(15)
-        heap.append(page.evaluate("(gc(), performance.memory.usedJSHeapSize)") / 1e6)
-    print(f"heap {np.round(heap, 2)} MB after each 15 s")
-    assert all(late - heap[1] < 1.0 for _, late in pairwise(heap[1:]))
+        data_kb.append(page.heap_bytes()["data"] / 1e3)
+    print(f"data {np.round(data_kb, 1)} kB after each 15 s")
+    assert max(data_kb[2:]) - data_kb[1] < 50

@@ -26,6 +26,7 @@ from websockets.sync.client import ClientConnection, connect
 
 IWER = "iwer@2.5.0"
 _CALL_S = 300.0  # on a busy machine
+_HEAP = {"code": "code", "object shape": "code", "native": "native"}  # what is no data of a page's scripts
 
 # A Quest 3 whose head, hands and recentering a test moves: `headset` is its device.
 _EMULATED = """
@@ -36,11 +37,15 @@ _EMULATED = """
     device.position.set(0, 1.6, 0);
     window.headset = device;
     window.move = null;  // moves it, just before each frame
+    let movedMs = 0;
     const step = () => {
         requestAnimationFrame(step);
-        window.move?.(performance.timeOrigin + performance.now());
+        movedMs = performance.now();
+        window.move?.(performance.timeOrigin + movedMs);
     };
     requestAnimationFrame(step);
+    // Frames are of when it was moved: on a busy machine tens of milliseconds may pass until one begins.
+    Object.defineProperty(XRFrame.prototype, "predictedDisplayTime", { get: () => movedMs });
 })();
 """
 
@@ -65,6 +70,8 @@ class BrowserPage:
     def __init__(self, endpoint: str) -> None:
         self._connection, self._number = _connect(endpoint), 0
         self.problems = list[str]()
+        self._traced, self._is_traced = list[dict[str, Any]](), False
+        self._snapshot = list[str]()
         for domain in ("Runtime", "Page", "Log"):
             self.call(f"{domain}.enable")
 
@@ -144,8 +151,43 @@ class BrowserPage:
     def picture(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
+    def begin_trace(self, *categories: str) -> None:
+        """Note events of all pages of the browser, with the CPU time of their threads."""
+        included = {"includedCategories": list(categories), "excludedCategories": ["*"]}
+        self.call("Tracing.start", traceConfig=included, transferMode="ReportEvents")
+
+    def end_trace(self) -> list[dict[str, Any]]:
+        self._traced, self._is_traced = [], False
+        self.call("Tracing.end")
+        while not self._is_traced:
+            self._note(json.loads(self._connection.recv(timeout=_CALL_S)))
+        return self._traced
+
+    def heap_bytes(self) -> dict[str, int]:
+        """Return what lies on the heap of its scripts after collection: `data` (objects, arrays, texts,
+        numbers, closures), `code` (compiled, with shapes of objects), `native` (of the browser itself)."""
+        self._snapshot = []
+        for _ in range(2):
+            self.call("HeapProfiler.collectGarbage")
+        self.call("HeapProfiler.takeHeapSnapshot", reportProgress=False)
+        snapshot = json.loads("".join(self._snapshot))
+        about, nodes = snapshot["snapshot"]["meta"], snapshot["nodes"]
+        fields, kinds = about["node_fields"], about["node_types"][0]
+        types = nodes[fields.index("type") :: len(fields)]
+        sizes = nodes[fields.index("self_size") :: len(fields)]
+        found = {"data": 0, "code": 0, "native": 0}
+        for kind, size in zip(types, sizes, strict=True):
+            found[_HEAP.get(kinds[kind], "data")] += size
+        return found
+
     def _note(self, event: dict[str, Any]) -> None:
         match event.get("method"):
+            case "HeapProfiler.addHeapSnapshotChunk":
+                self._snapshot.append(event["params"]["chunk"])
+            case "Tracing.dataCollected":
+                self._traced += event["params"]["value"]
+            case "Tracing.tracingComplete":
+                self._is_traced = True
             case "Runtime.exceptionThrown":
                 details = event["params"]["exceptionDetails"]
                 self.problems.append(details.get("exception", {}).get("description", details["text"]))

@@ -1,6 +1,7 @@
 """The headset page in figures: emulated headsets in Chromium, and a wearer's motion without one. Prints JSON.
 
     python tools/experiments/measure_headset_page.py marker [--link wifi5] [--seconds 30] [--seed 1]
+    python tools/experiments/measure_headset_page.py script [--seconds 30]
     python tools/experiments/measure_headset_page.py memory [--seconds 180]
     python tools/experiments/measure_headset_page.py goal [--count 20]
     python tools/experiments/measure_headset_page.py align [--seeds 500:540]
@@ -10,10 +11,12 @@ marker: two wearers, emulated Quest 3s of 320 x 160 px (drawn in software), walk
 along the floor. For each place that both drew: by how much later the other drew it, by the wall clock, from
 frame to frame. Also the times of frames, what a frame takes in script, and from a pose's stamp to its
 frame.
-memory: the heap of a page, after collection, while its wearer walks and drags a marker.
+script: what a page takes in script a frame, by the CPU time of its thread, with two pages that drag a marker.
+memory: what lies on the heap of a page's scripts, after collection, while its wearer walks and drags a
+marker: its data, compiled code, what the browser itself has.
 goal: the trigger pulled on "Go there" -> the page hears that a robot's action server has accepted, so the
 way back is in it. Needs SHARE_ROS, an environment with rclpy (CONTRIBUTING.md).
-All three: the edge's own page server, the edge's protocol on a real link without mapper and agents; --link:
+All four: the edge's own page server, the edge's protocol on a real link without mapper and agents; --link:
 between each page and the server.
 align, follow: `headset_motion.py`.
 """
@@ -42,8 +45,11 @@ from headset_motion import measure_alignment, measure_follow  # noqa: E402
 from helpers import emulated_wearer as worn  # noqa: E402
 from helpers.browser import Browser, BrowserPage, browser  # noqa: E402
 from helpers.delayed_port import DelayedPort  # noqa: E402
+from helpers.script_time import mark_frames, script_cpu_ms  # noqa: E402
 from helpers.served_room import ServedRoom, served_room  # noqa: E402
 from make_keyframe_sets import seeds_of  # noqa: E402
+from scipy.stats import linregress  # noqa: E402
+from scipy.stats import t as student_t  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
@@ -53,6 +59,7 @@ from share.lab.evaluate.provenance import describe_machine  # noqa: E402
 _SIZE = (320, 160)
 _DRAG_S = 3.0
 _HEAP_EVERY_S = 15.0
+_SETTLED_MIN = 2.0
 
 Figures = dict[str, Any]
 
@@ -61,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     measures: dict[str, Callable[[argparse.Namespace], Figures]] = {
         "marker": marker,
+        "script": script,
         "memory": memory,
         "goal": goal,
         "align": lambda options: measure_alignment(options.seeds),
@@ -82,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    made.add_argument("what", choices=("marker", "memory", "goal", "align", "follow"))
+    made.add_argument("what", choices=("marker", "script", "memory", "goal", "align", "follow"))
     made.add_argument("--link", metavar="NAME", help="an emulated network, such as wifi5")
     made.add_argument("--seconds", type=float, default=30.0)
     made.add_argument("--seed", type=int, default=1, help="of the emulated network")
@@ -124,6 +132,24 @@ def marker(options: argparse.Namespace) -> Figures:
         }
 
 
+def script(options: argparse.Namespace) -> Figures:
+    figures: Figures = {"pages": {}}
+    with _wearers(options, ("ann", "ben")) as (_, (ann, ben)):
+        for name, page in (("ann", ann), ("ben", ben)):
+            mark_frames(page)
+            began = time.monotonic()
+            frames, others = script_cpu_ms(page, lambda: worn.drag_marker(ann, options.seconds / 2))
+            figures["pages"][name] = {
+                "frames_per_s": round(len(frames) / (time.monotonic() - began), 1),
+                "cpu_ms_of_a_frame": _spread(frames),
+                "share_over_2_ms": round(float(np.mean(np.array(frames) > 2)), 4),
+                "cpu_ms_of_all_script_by_frames": round((sum(frames) + sum(others)) / len(frames), 3),
+            }
+            ann.app("(app.connection.remove([...app.room.objects.keys()][0]), 0)")
+            ann.wait("app.room.objects.size === 0", 20)
+    return figures
+
+
 def memory(options: argparse.Namespace) -> Figures:
     with _wearers(options, ("ann",)) as (_, (ann,)):
         worn.push(ann, "marker")
@@ -132,19 +158,31 @@ def memory(options: argparse.Namespace) -> Figures:
             "(drags = (ms) => { const s = Math.sin(ms / 1000);"
             " aims = { ...aims, at: [0.6 - s, 0, -1.4 - 0.5 * s] }; }, 0)"
         )
-        frames, heap = ann.app("app.frames"), []
-        end = time.monotonic() + options.seconds
-        while time.monotonic() < end:
+        frames, began, heap = ann.app("app.frames"), time.monotonic(), list[tuple[float, dict[str, int]]]()
+        while (now := time.monotonic()) - began < options.seconds:
             time.sleep(_HEAP_EVERY_S)
-            heap.append(ann.evaluate("(gc(), performance.memory.usedJSHeapSize)") / 1e6)
-        later = heap[2:]  # the first half minute fills histories
-        minutes = np.arange(len(later)) * _HEAP_EVERY_S / 60
+            heap.append(((now - began + _HEAP_EVERY_S) / 60, ann.heap_bytes()))
+        later = [one for one in heap if one[0] >= _SETTLED_MIN]
         return {
             "seconds": options.seconds,
             "frames": ann.app("app.frames") - frames,
-            "heap_mb": np.round(heap, 3).tolist(),
-            "growth_kb_per_minute": round(1e3 * np.polyfit(minutes, later, 1)[0], 1),
+            "minutes": [round(minute, 2) for minute, _ in heap],
+            "heap_kb": {kind: [round(some[kind] / 1e3, 1) for _, some in heap] for kind in heap[0][1]},
+            "growth_kb_per_minute_from_2": {
+                kind: _growth([minute for minute, _ in later], [some[kind] / 1e3 for _, some in later])
+                for kind in heap[0][1]
+            },
         }
+
+
+def _growth(minutes: Sequence[float], values: Sequence[float]) -> Figures:
+    """Slope of a line with its interval of 95 %, as of errors that do not last."""
+    x, y = np.asarray(minutes), np.asarray(values)
+    if len(x) < 3:
+        return {"n": len(x)}
+    line = linregress(x, y)
+    half = line.stderr * student_t.ppf(0.975, len(x) - 2)
+    return {"n": len(x), "slope": round(line.slope, 3), "half_interval": round(half, 3)}
 
 
 def goal(options: argparse.Namespace) -> Figures:

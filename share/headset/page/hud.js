@@ -77,8 +77,9 @@ export class Hud {
     update() {
         const { app } = this;
         const isPaired = app.connection.isPaired;
-        at("start").hidden = isPaired;
         at("bar").hidden = !isPaired || app.isInHeadset;
+        if (app.isInHeadset) return;  // where nobody sees the page
+        at("start").hidden = isPaired;
         at("reason").textContent = isPaired ? "" : app.connection.text === "not paired" ? "" : app.connection.text;
         const lines = isPaired ? stateLines(app) : [];
         while (this.#texts.length < lines.length) {

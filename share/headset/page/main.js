@@ -24,8 +24,6 @@ class App {
     wearer = "";
     may = { objects: false, commands: false };
     place = { mapId: null, floorZ: 0, T_map_local: identity() };  // of the present frame
-    alignmentMm = null;
-    driftMmS = null;
     latency = new Latency();  // pose to frame
     script = new Latency();  // what a frame takes here
     session = null;
@@ -68,6 +66,15 @@ class App {
     // What is the case, line by line: [text, colour].
     get lines() {
         return stateLines(this);
+    }
+
+    // One sigma of where the headset is in the map, mm, and by how much that moves, mm/s; null where it is not known.
+    get alignmentMm() {
+        return this.isInHeadset ? this.placement.sigmaMm(this.#T_local_viewer) : null;
+    }
+
+    get driftMmS() {
+        return this.isInHeadset ? this.placement.driftMmS(this.#T_local_viewer, performance.now()) : null;
     }
 
     // T_local_viewer of the present frame.
@@ -177,10 +184,7 @@ class App {
         this.interaction.hover(preview.pointers);
         this.scene.update(place.mapId, timeMs, this.connection.clock);
         this.#fillFrame(preview.eye, preview.pointers);
-        const gl = renderer.gl;
-        gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-        gl.clearColor(0, 0, 0, 0);
-        gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+        renderer.beginFrame(null);
         multiply(this.#viewProjection, preview.projection, preview.T_camera_map);
         renderer.beginView(0, 0, width, height, this.#viewProjection);
         this.scene.draw(this.#frame);
@@ -264,7 +268,6 @@ class App {
         if (this.session !== session) return;
         for (const inputSource of [...this.#pointers.keys()]) this.#dropPointer(inputSource);
         this.session = this.interaction.panel = null;
-        this.alignmentMm = this.driftMmS = null;
         this.#beginFlat();
     }
 
@@ -285,11 +288,8 @@ class App {
         this.scene.update(place.mapId, displayMs, this.connection.clock);
         transformPoint(this.#eye, place.T_map_local, this.#T_local_viewer.subarray(12, 15));
         this.#fillFrame(this.#eye, this.#shownPointers);
-        const gl = renderer.gl;
         const layer = session.renderState.baseLayer;
-        gl.bindFramebuffer(gl.FRAMEBUFFER, layer.framebuffer);
-        gl.clearColor(0, 0, 0, 0);
-        gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+        renderer.beginFrame(layer.framebuffer);
         for (const view of viewer.views) {
             const { x, y, width, height } = layer.getViewport(view);
             inverse(this.#T_view_map, multiply(this.#T_view_map, place.T_map_local, view.transform.matrix));
@@ -297,8 +297,6 @@ class App {
             renderer.beginView(x, y, width, height, this.#viewProjection);
             this.scene.draw(this.#frame);
         }
-        this.alignmentMm = placement.sigmaMm(this.#T_local_viewer);
-        this.driftMmS = placement.driftMmS(this.#T_local_viewer, displayMs);
         this.#noteFrame(beganMs, displayMs, this.room.agents.get(this.room.ownAgent));
     };
 

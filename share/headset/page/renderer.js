@@ -1,7 +1,8 @@
 // Draws shapes on WebGL2: solids, wide lines, points, and pictures of text. Blends premultiplied, over what the headset
-// sees through its cameras or over the page's background. A frame makes nothing anew.
+// sees through its cameras or over the page's background. A frame makes nothing anew, and sets no state that is set.
 import { LINES, SOLIDS } from "./geometry.js";
 
+const WHITE = [1, 1, 1];
 const HEADER = "#version 300 es\nprecision highp float;\n";
 const COMMON = `${HEADER}uniform mat4 viewProjection, model; uniform vec4 colour;`;
 
@@ -57,6 +58,12 @@ const PICTURE = [
 ];
 
 export class Renderer {
+    #view = 0;  // how many were begun
+    #used = null;  // program
+    #bound = null;  // array
+    #hides = true;  // what is drawn, what comes behind it
+    #isHidden = true;  // what is drawn, behind what is there
+
     constructor(canvas) {
         const gl = canvas.getContext("webgl2", { alpha: true, antialias: true, xrCompatible: true });
         if (gl === null) throw new Error("this browser has no WebGL2");
@@ -69,17 +76,29 @@ export class Renderer {
         this.lines = Object.fromEntries(
             Object.entries(LINES).map(([name, data]) => [name, this.setLines(null, new Float32Array(data))]),
         );
+        this.noArray = gl.createVertexArray();  // of pictures, whose corners are counted
         this.viewProjection = new Float32Array(16);
         this.size = new Float32Array(2);
         gl.enable(gl.BLEND);
         gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     }
 
+    // Begin a frame, on the screen where framebuffer is null. What others left set is not relied on.
+    beginFrame(framebuffer) {
+        const gl = this.gl;
+        gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+        this.#used = this.#bound = null;
+        gl.enable(gl.DEPTH_TEST);
+        gl.depthMask(true);  // else its depths are not cleared
+        this.#hides = this.#isHidden = true;
+        gl.clearColor(0, 0, 0, 0);
+        gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    }
+
     // Begin one eye's picture, or the whole one.
     beginView(x, y, width, height, viewProjection) {
-        const gl = this.gl;
-        gl.viewport(x, y, width, height);
-        gl.enable(gl.DEPTH_TEST);
+        this.#view++;
+        this.gl.viewport(x, y, width, height);
         this.size[0] = width;
         this.size[1] = height;
         this.viewProjection.set(viewProjection);
@@ -88,7 +107,7 @@ export class Renderer {
     drawSolid(name, model, colour, alpha = 1) {
         const { array, count } = this.solids[name];
         this.#use(this.solid, model, colour, alpha);
-        this.#draw(array, this.gl.TRIANGLES, count, 0, alpha);
+        this.#draw(array, this.gl.TRIANGLES, count, 0, alpha >= 1);
     }
 
     // width px; fade: the distance at which they have vanished, m.
@@ -96,33 +115,33 @@ export class Renderer {
         const { array, count } = typeof shape === "string" ? this.lines[shape] : shape;
         if (count === 0) return;
         this.#use(this.line, model, colour, alpha);
-        this.gl.uniform2fv(this.line.at.size, this.size);
-        this.gl.uniform1f(this.line.at.width, width);
-        this.gl.uniform1f(this.line.at.fade, fade);
-        this.#draw(array, this.gl.TRIANGLE_STRIP, 4, count, alpha);
+        const { at, wide } = this.line;
+        if (wide.view !== this.#view) this.gl.uniform2fv(at.size, this.size);
+        wide.view = this.#view;
+        if (wide.width !== width) this.gl.uniform1f(at.width, (wide.width = width));
+        if (wide.fade !== fade) this.gl.uniform1f(at.fade, (wide.fade = fade));
+        this.#draw(array, this.gl.TRIANGLE_STRIP, 4, count, alpha >= 1);
     }
 
     drawPoints({ array, count }, model, colour, alpha = 1) {
         if (count === 0) return;
         this.#use(this.point, model, colour, alpha);
         this.gl.uniform1f(this.point.at.width, 0.006 * this.size[1]);  // 12 mm at a field of view of 90 degrees
-        this.#draw(array, this.gl.POINTS, count, 0, alpha);
+        this.#draw(array, this.gl.POINTS, count, 0, alpha >= 1);
     }
 
     drawPicture(texture, model, alpha = 1, isInFront = false) {
         const gl = this.gl;
-        if (isInFront) gl.disable(gl.DEPTH_TEST);
-        this.#use(this.picture, model, [1, 1, 1], alpha);
+        this.#use(this.picture, model, WHITE, alpha);
         gl.bindTexture(gl.TEXTURE_2D, texture);
-        this.#draw(null, gl.TRIANGLE_STRIP, 4, 0, 0);
-        gl.enable(gl.DEPTH_TEST);
+        this.#draw(this.noArray, gl.TRIANGLE_STRIP, 4, 0, false, isInFront);
     }
 
     // Segments [ax ay az bx by bz ..] on the card: a new buffer, or the one that `lines` had.
     setLines(lines, data) {
         const gl = this.gl;
         lines ??= { array: gl.createVertexArray(), buffer: gl.createBuffer(), count: 0 };
-        gl.bindVertexArray(lines.array);
+        gl.bindVertexArray((this.#bound = lines.array));
         gl.bindBuffer(gl.ARRAY_BUFFER, lines.buffer);
         gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
         for (const k of [0, 1]) {
@@ -145,7 +164,7 @@ export class Renderer {
     setPoints(points, data, count) {
         const gl = this.gl;
         points ??= { array: gl.createVertexArray(), buffer: gl.createBuffer(), count: 0 };
-        gl.bindVertexArray(points.array);
+        gl.bindVertexArray((this.#bound = points.array));
         gl.bindBuffer(gl.ARRAY_BUFFER, points.buffer);
         gl.bufferData(gl.ARRAY_BUFFER, data.subarray(0, 3 * count), gl.STATIC_DRAW);
         gl.enableVertexAttribArray(0);
@@ -174,22 +193,28 @@ export class Renderer {
         this.gl.deleteTexture(texture);
     }
 
-    #use(program, model, [r, g, b], alpha) {
+    #use(program, model, colour, alpha) {
         const gl = this.gl;
-        gl.useProgram(program.program);
-        gl.uniformMatrix4fv(program.at.viewProjection, false, this.viewProjection);
+        if (this.#used !== program) gl.useProgram(program.program);
+        this.#used = program;
+        if (program.view !== this.#view) gl.uniformMatrix4fv(program.at.viewProjection, false, this.viewProjection);
+        program.view = this.#view;
         gl.uniformMatrix4fv(program.at.model, false, model);
-        gl.uniform4f(program.at.colour, r, g, b, alpha);
+        gl.uniform4f(program.at.colour, colour[0], colour[1], colour[2], alpha);
     }
 
-    // What one sees through hides nothing behind it.
-    #draw(array, mode, count, instances, alpha) {
+    // hides: what one sees through hides nothing behind it.
+    #draw(array, mode, count, instances, hides, isInFront = false) {
         const gl = this.gl;
-        gl.depthMask(alpha >= 1);
-        gl.bindVertexArray(array);
+        if (this.#hides !== hides) gl.depthMask((this.#hides = hides));
+        if (this.#isHidden === isInFront) {
+            this.#isHidden = !isInFront;
+            if (isInFront) gl.disable(gl.DEPTH_TEST);
+            else gl.enable(gl.DEPTH_TEST);
+        }
+        if (this.#bound !== array) gl.bindVertexArray((this.#bound = array));
         if (instances > 0) gl.drawArraysInstanced(mode, 0, count, instances);
         else gl.drawArrays(mode, 0, count);
-        gl.depthMask(true);
     }
 
     #solidOf(data) {
@@ -217,6 +242,7 @@ export class Renderer {
         gl.linkProgram(program);
         if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
         const names = ["viewProjection", "model", "colour", "size", "width", "fade"];
-        return { program, at: Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)])) };
+        const at = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
+        return { program, at, view: 0, wide: { view: 0, width: null, fade: null } };  // as set last
     }
 }
