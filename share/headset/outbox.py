@@ -6,6 +6,7 @@ from typing import Any
 
 MAX_REPLIES = 256  # answers that wait; a page with more does not read
 POSES_S = 1 / 60  # between messages with poses: agents of 30 Hz do not keep step with each other
+MAX_UNSEEN = 16  # messages with poses on their way: what waits in sockets and in the browser is out of reach
 
 
 class Outbox:
@@ -20,6 +21,7 @@ class Outbox:
         self._robots: dict[str | None, dict[str, Any]] = {}
         self._poses: dict[str, dict[str, Any]] = {}
         self._poses_due_s = 0.0
+        self._sent_poses = self._seen_poses = 0  # messages
 
     def reply(self, message: dict[str, Any]) -> None:
         """Add a message that must not be left out."""
@@ -32,6 +34,10 @@ class Outbox:
         for pose in poses:
             old = self._poses.get(pose["agent"], {})
             self._poses[pose["agent"]] = {"path": old["path"], **pose} if "path" in old else pose
+
+    def mark_seen(self, count: int) -> None:
+        """Note that the page has handled its first `count` messages with poses."""
+        self._seen_poses = max(self._seen_poses, min(count, self._sent_poses))
 
     def put_object(self, one: dict[str, Any]) -> None:
         self._removed.pop(one["id"], None)
@@ -66,12 +72,17 @@ class Outbox:
         if self._robots:
             out.append({"type": "robots", "robots": list(self._robots.values())})
             self._robots = {}
-        if self._poses and now_s >= self._poses_due_s:
+        if self._has_poses_to_send and now_s >= self._poses_due_s:
             self._poses_due_s = now_s + POSES_S
-            out.append({"type": "poses", "poses": list(self._poses.values())})
+            self._sent_poses += 1
+            out.append({"type": "poses", "n": self._sent_poses, "poses": list(self._poses.values())})
             self._poses = {}
         return out
 
     def wait_s(self, now_s: float) -> float | None:
         """Return after how long there is something to send; None: not by time alone."""
-        return max(0.0, self._poses_due_s - now_s) if self._poses else None
+        return max(0.0, self._poses_due_s - now_s) if self._has_poses_to_send else None
+
+    @property
+    def _has_poses_to_send(self) -> bool:
+        return bool(self._poses) and self._sent_poses - self._seen_poses < MAX_UNSEEN

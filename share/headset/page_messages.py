@@ -57,6 +57,12 @@ class PagePing(Struct, tag_field="type", tag="ping"):
     sent_ms: _Time
 
 
+class PageSeen(Struct, tag_field="type", tag="seen"):
+    """The page has handled the poses up to message `n`."""
+
+    n: _Count
+
+
 class PagePut(Struct, tag_field="type", tag="put"):
     request: _Count
     id: _Id
@@ -105,7 +111,7 @@ class PageMeasured(Struct, tag_field="type", tag="measured"):
 
 PageRequest = PagePut | PageRemove
 PageCommand = PageGoto | PageCancel
-PageMessage = PageHello | PagePing | PageRequest | PageCommand | PagePoints | PageMeasured
+PageMessage = PageHello | PagePing | PageSeen | PageRequest | PageCommand | PagePoints | PageMeasured
 _decoder: msgspec.json.Decoder[PageMessage] = msgspec.json.Decoder(PageMessage)
 
 

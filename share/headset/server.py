@@ -312,6 +312,9 @@ class HeadsetServer:
                 case page.PagePing(n, sent_ms):
                     t_ms = time.monotonic_ns() / 1e6
                     seat.reply({"type": "pong", "n": n, "sent_ms": sent_ms, "t_ms": t_ms})
+                case page.PageSeen(n):
+                    seat.outbox.mark_seen(n)
+                    seat.wake.set()
                 case page.PagePoints(map_id):
                     if seat.points_limit.take(time.monotonic_ns()):
                         self._send_points(seat, map_id)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any
 
-from share.headset.outbox import MAX_REPLIES, Outbox
+from share.headset.outbox import MAX_REPLIES, MAX_UNSEEN, Outbox
 
 
 def pose(agent: str, t: float, **more: Any) -> dict[str, Any]:
@@ -21,7 +21,7 @@ def test_a_page_that_is_slow_gets_the_newest_of_each_thing() -> None:
     assert box.take(0.0) == [
         {"type": "objects", "all": False, "objects": [{"id": 1, "position": [99, 0, 0]}], "removed": []},
         {"type": "robots", "robots": [{"robot": "tb", "x": 99}]},
-        {"type": "poses", "poses": [pose("ann", 99, path=[[0, 0, 50]]), pose("bob", -99)]},
+        {"type": "poses", "n": 1, "poses": [pose("ann", 99, path=[[0, 0, 50]]), pose("bob", -99)]},
     ]
     assert box.take(1.0) == [] and box.wait_s(1.0) is None
 
@@ -32,10 +32,34 @@ def test_poses_come_sixty_times_a_second_at_most() -> None:
         box.put_poses([pose("ann", ms)])
         if box.take(ms / 1000):
             sent.append(ms)
+            box.mark_seen(len(sent))
     assert 57 <= len(sent) <= 61 and min(b - a for a, b in pairwise(sent)) >= 16
     box.put_poses([pose("ann", 0)])
     wait = box.wait_s(1.0)
     assert wait is not None and 0 < wait <= 1 / 60
+
+
+def test_a_page_that_does_not_keep_up_has_few_poses_on_their_way() -> None:
+    """They would wait in sockets and in the browser: it drew poses that were 15 s old."""
+    box = Outbox()
+
+    def play(first_s: int) -> list[dict[str, Any]]:
+        sent = []
+        for tick in range(60 * first_s, 60 * (first_s + 1)):
+            box.put_poses([pose("ann", tick)])
+            sent += box.take(tick / 59)
+        return sent
+
+    sent = play(0)
+    assert [one["n"] for one in sent] == list(range(1, MAX_UNSEEN + 1))
+    assert play(1) == [] and box.wait_s(2.0) is None
+    box.mark_seen(4)
+    assert box.wait_s(2.0) is not None
+    more = play(2)
+    assert [one["n"] for one in more] == [*range(MAX_UNSEEN + 1, MAX_UNSEEN + 5)]
+    assert more[0]["poses"] == [pose("ann", 120)]  # the newest
+    box.mark_seen(10**9)  # of a page that claims too much
+    assert len(play(3)) == MAX_UNSEEN
 
 
 def test_of_an_object_the_last_word_counts() -> None:

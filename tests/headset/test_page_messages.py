@@ -27,6 +27,7 @@ VALID: list[dict[str, Any]] = [
     GOTO,
     {"type": "cancel", "command": 10, "robot": "tb"},
     {"type": "points", "map_id": "ann-1/0"},
+    {"type": "seen", "n": 4},
     {"type": "measured", "mode": "align", "frames": 90, "over_20ms": 1, "p50_ms": 12.0, "alignment_mm": None},
 ]
 

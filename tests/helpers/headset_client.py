@@ -71,6 +71,9 @@ class PageClient:
     def hear(self, timeout_s: float = WAIT_S) -> dict[str, Any]:
         message: dict[str, Any] = json.loads(self.socket.recv(timeout=timeout_s))
         self.seen.append(message)
+        if message["type"] == "poses":  # a page acknowledges every fourth
+            with suppress(ConnectionClosed):
+                self.send(type="seen", n=message["n"])
         return message
 
     def wait(self, kind: str, is_it: Callable[[dict[str, Any]], bool] = lambda m: True) -> dict[str, Any]:

@@ -7,6 +7,7 @@ const FIRST_WAIT_MS = 500;
 const LONGEST_WAIT_MS = 5000;
 const PING_MS = 1000;
 const FIRST_PINGS = 5;  // in quick succession, for the clock
+const SEEN_EVERY = 4;  // messages with poses; the server waits once 16 were not acknowledged
 const SILENT_MS = 3500;  // without any message the connection counts as lost
 const SECRET = "share-session";  // in sessionStorage: a page that is loaded again goes on
 const OUTDATED = "share-outdated";  // in sessionStorage: it has loaded itself again, for an edge of another release
@@ -161,6 +162,7 @@ export class Connection {
                 this.#forget(({ type, command }) => type === "cancel" && command === message.command);
         }
         this.#onMessage(message);
+        if (message.type === "poses" && message.n % SEEN_EVERY === 0) this.#send({ type: "seen", n: message.n });
     }
 
     #forget(isAnswered) {
