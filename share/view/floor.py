@@ -11,7 +11,7 @@ _STEP_M = 0.3  # a lower floor is not drawn again for less
 _MARGIN_M, _MOST_SPARE_M = 1.0, 6.0
 
 
-class Floor:
+class DrawnFloor:
     """About as wide as the points; drawn again only where they have left it, or it is far too large."""
 
     def __init__(self) -> None:

@@ -23,7 +23,7 @@ from share.view import drawing as dr
 from share.view import events as ev
 from share.view.agent_paths import PlacedKeyframe, RunPath
 from share.view.drawing import frusta, lines, named, shifted
-from share.view.floor import Floor
+from share.view.floor import DrawnFloor
 from share.view.loop_views import KeyframePictures, LoopLines, LoopViews, Pair, nearest_to_ray
 from share.view.map_arrangement import MapArrangement
 from share.view.pending_drawings import PendingDrawings
@@ -61,7 +61,7 @@ class DrawnRoom:
         self._pending.remove_all()
         self._moved_runs: set[str] = set()
         self._pictures: dict[str, bytes] = {}
-        self._floor = Floor()
+        self._floor = DrawnFloor()
         self._announcements: list[dr.Announcement] = []
         self._announced_s: deque[float] = deque(maxlen=_MAX_ANNOUNCEMENTS)
 
