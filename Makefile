@@ -3,6 +3,9 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
+# Tests start hundreds of processes, and each of pytest's workers rewrites all tests: compiled once, not each time.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: install demo test unit lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures docs
 
 CHECK_PYTHON := $(PYTHON) -c "import sys; v = sys.version_info; v >= (3, 11) or sys.exit('SHARE needs Python 3.11 or newer; $(PYTHON) is %d.%d. Name another: make PYTHON=/path/to/python3.11' % v[:2])"
