@@ -276,6 +276,8 @@ class Commands:
 
     def start(self, *words: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "share", "robot", *words]
+        if words[0] != "bridge":  # a commander that starts does not take the bridge's computer
+            command = ["nice", "-n", "10", *command]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         self.processes.append(subprocess.Popen(command, env=self.environment, **pipes))
         return self.processes[-1]
