@@ -29,7 +29,7 @@ unit: install  # the inner loop: what decides, without what takes a second or mo
 	$(BIN)/pytest -n auto --maxprocesses 4 -m "not slow and not torture and not long" tests/geometry tests/vision tests/scheduling tests/metrics tests/wire tests/sensors tests/protocol tests/mapping tests/odometry
 test: install
 	$(BIN)/pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --ignore tests/run
-	$(BIN)/pytest -n auto --maxprocesses 2 --dist loadfile tests/run $(BUSY:%=--ignore %)  # real time: mostly waiting
+	$(BIN)/pytest -n $(WORKERS) --maxprocesses 3 --dist loadfile tests/run $(BUSY:%=--ignore %)  # real time: mostly waiting
 	$(BIN)/pytest $(BUSY)  # with the cores to themselves
 BUSY := tests/run/test_kitchen.py tests/run/test_streamed.py# their processes fill two cores
 SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial tests/torture  # in real time, or with their own processes
