@@ -3,6 +3,9 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
+# Tests start hundreds of processes, and each of pytest's workers rewrites all tests: compiled once, not each time.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: install demo test unit lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures docs
 
 CHECK_PYTHON := $(PYTHON) -c "import sys; v = sys.version_info; v >= (3, 11) or sys.exit('SHARE needs Python 3.11 or newer; $(PYTHON) is %d.%d. Name another: make PYTHON=/path/to/python3.11' % v[:2])"
@@ -26,7 +29,7 @@ unit: install  # the inner loop: what decides, without what takes a second or mo
 	$(BIN)/pytest -n auto --maxprocesses 4 -m "not slow and not torture and not long" tests/geometry tests/vision tests/scheduling tests/metrics tests/wire tests/sensors tests/protocol tests/mapping tests/odometry
 test: install
 	$(BIN)/pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --ignore tests/run
-	$(BIN)/pytest -n auto --maxprocesses 2 --dist loadfile tests/run $(BUSY:%=--ignore %)  # real time: mostly waiting
+	$(BIN)/pytest -n $(WORKERS) --maxprocesses 3 --dist loadfile tests/run $(BUSY:%=--ignore %)  # real time: mostly waiting
 	$(BIN)/pytest $(BUSY)  # with the cores to themselves
 BUSY := tests/run/test_kitchen.py tests/run/test_streamed.py# their processes fill two cores
 SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial tests/torture  # in real time, or with their own processes

@@ -8,6 +8,7 @@ looked up as tf2 does, between two stamps and never beyond the last.
 
 import bisect
 import contextlib
+import itertools
 import json
 import math
 import sys
@@ -32,7 +33,8 @@ LATCHED = QoSProfile(
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 TF_ERROR = 9002
 TOO_FAR_M = 100.0  # a goal so far away is refused
-STEP_S = 0.005
+STEP_S = 0.1  # timers and messages wake it earlier
+LATE_NS = 300_000_000  # a drive needs map → odom of so long ago
 
 
 def odometry_at(seconds: float) -> tuple[float, float, float]:
@@ -55,11 +57,11 @@ class RosRobot(Node):
     def __init__(self, begin_s: float, drive_s: float, namespace: str, fault: str) -> None:
         super().__init__("robot", namespace=namespace)
         self.begin_s, self.drive_s, self.fault = begin_s, drive_s, fault
-        self.stamps: list[float] = []
+        self.stamps: list[int] = []  # ns
         self.transforms: list[tuple[float, float, float]] = []
         self.odometry = self.create_publisher(Odometry, "odom", BEST_EFFORT)
         self.tf = self.create_publisher(TFMessage, "tf", 10)
-        self.create_subscription(TFMessage, "tf", self.on_tf, 100)
+        self.heard = self.create_subscription(TFMessage, "tf", self.on_tf, 100)
         self.create_subscription(TFMessage, "tf_static", self.on_static, LATCHED)
         self.create_subscription(OccupancyGrid, "map", self.on_map, LATCHED)
         self.create_subscription(SpeedLimit, "speed_limit", lambda m: say(speed_limit=m.speed_limit), 10)
@@ -104,13 +106,16 @@ class RosRobot(Node):
             self.tf.publish(TFMessage(transforms=[other]))
 
     def on_tf(self, message: TFMessage) -> None:
-        for one in message.transforms:
+        """Take this message and all that wait: a busy machine else leaves rclpy, which takes one at a time,
+        ever further behind."""
+        waiting = (taken[0] for taken in iter(lambda: self.heard.handle.take_message(TFMessage, False), None))
+        for one in itertools.chain(message.transforms, *(more.transforms for more in waiting)):
             if one.child_frame_id != "odom":
                 continue
             t, q = one.transform.translation, one.transform.rotation
-            stamp = one.header.stamp.sec + one.header.stamp.nanosec / 1e9
+            stamp = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
             if self.stamps and stamp <= self.stamps[-1]:
-                say(error=f"a stamp falls by {self.stamps[-1] - stamp}")
+                say(error=f"a stamp falls by {self.stamps[-1] - stamp} ns")
                 continue
             self.stamps.append(stamp)
             self.transforms.append((t.x, t.y, 2 * math.atan2(q.z, q.w)))
@@ -119,20 +124,21 @@ class RosRobot(Node):
 
     def look_up(self) -> None:
         """Say where the robot is in the map now, or that tf2 would have to extrapolate."""
-        now = time.time()
-        place = self.map_odom(now)
+        now_ns = time.time_ns()
+        now, place = now_ns / 1e9, self.map_odom(now_ns)
         if place is None:
             say(tf_missing=now)
             return
         (x, y, yaw), (ox, oy, oyaw) = place, odometry_at(now - self.begin_s)
         c, s = math.cos(yaw), math.sin(yaw)
-        say(tf=[now, x + c * ox - s * oy, y + s * ox + c * oy, yaw + oyaw], ahead=self.stamps[-1] - now)
+        ahead = (self.stamps[-1] - now_ns) / 1e9
+        say(tf=[now, x + c * ox - s * oy, y + s * ox + c * oy, yaw + oyaw], ahead=ahead)
 
-    def map_odom(self, now: float) -> tuple[float, float, float] | None:
-        i = bisect.bisect_left(self.stamps, now)
+    def map_odom(self, now_ns: int) -> tuple[float, float, float] | None:
+        i = bisect.bisect_left(self.stamps, now_ns)
         if i == 0 or i == len(self.stamps):
             return None
-        u = (now - self.stamps[i - 1]) / (self.stamps[i] - self.stamps[i - 1])
+        u = (now_ns - self.stamps[i - 1]) / (self.stamps[i] - self.stamps[i - 1])
         a, b = self.transforms[i - 1], self.transforms[i]
         turn = math.remainder(b[2] - a[2], 2 * math.pi)
         return a[0] + u * (b[0] - a[0]), a[1] + u * (b[1] - a[1]), a[2] + u * turn
@@ -160,7 +166,7 @@ class RosRobot(Node):
                 handle.canceled()
                 say(ended="canceled")
                 return result
-            if self.fault != "patient" and self.map_odom(time.time() - 0.3) is None:
+            if self.fault != "patient" and self.map_odom(time.time_ns() - LATE_NS) is None:
                 if hasattr(result, "error_code"):
                     result.error_code, result.error_msg = TF_ERROR, "no transform"
                 handle.abort()

@@ -71,7 +71,7 @@ def room(
         rooms.append(RosRoom(messages[1], domain, tmp_path, **more))
         if not is_ready:
             return rooms[-1]
-        assert rooms[-1].run(30.0, rooms[-1].is_ready), rooms[-1].printed
+        assert rooms[-1].run(60.0, rooms[-1].is_ready), rooms[-1].printed
         return rooms[-1]
 
     yield open_room
@@ -116,7 +116,7 @@ def test_the_map_is_latched_and_the_body_is_known(
     messages: tuple[str, Path], room: Callable[..., RosRoom]
 ) -> None:
     here = room()
-    assert here.run(5.0, lambda: here.robot.of("map") and here.robot.of("static"))
+    assert here.run(30.0, lambda: here.robot.of("map") and here.robot.of("static"))
     (told,) = here.robot.of("map")
     assert told["map"] == pytest.approx([800, 800, 0.05, -20.0, -20.0], abs=1e-6)
     assert (told["free"], told["occupied"]) == (640_000, 0)
@@ -125,7 +125,7 @@ def test_the_map_is_latched_and_the_body_is_known(
 
 def test_a_goal_is_reached(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     here = room()
-    assert_goal_is_reached(here, messages[0], within_s=15.0)
+    assert_goal_is_reached(here, messages[0], within_s=40.0)
 
 
 def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
@@ -134,21 +134,21 @@ def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., Ros
     took_ms = []
     with RoomServer() as server, ShareRoom(server.address, "ann") as ann:
         here = room(drive_s=20.0, edge=server.address)
-        assert here.run(5.0, lambda: here.link.client.is_connected)
+        assert here.run(30.0, lambda: here.link.client.is_connected)
         for k in range(count):
             here.robot.forget()
             began = time.perf_counter()
             goal = ann.goto(1.0 + 0.1 * k, 0.5)
-            assert here.run(10.0, lambda goal=goal: re.match("accepted|executing|.* to go", goal.text)), (
+            assert here.run(30.0, lambda goal=goal: re.match("accepted|executing|.* to go", goal.text)), (
                 goal.text
             )
             took_ms.append(1e3 * (time.perf_counter() - began))
             # a server of rclpy never ends a goal that is cancelled before it executes
-            assert here.run(10.0, lambda goal=goal: goal.text.endswith("to go")), goal.text
+            assert here.run(30.0, lambda goal=goal: goal.text.endswith("to go")), goal.text
             goal.cancel()
-            assert here.run(10.0, lambda goal=goal: goal.is_final), goal.text
+            assert here.run(30.0, lambda goal=goal: goal.is_final), goal.text
             assert goal.text == "stopped: cancelled by 'ann'"
-            assert here.run(5.0, lambda: here.robot.of("ended"))
+            assert here.run(30.0, lambda: here.robot.of("ended"))
             assert here.robot.of("goal") == [{"goal": [pytest.approx(1.0 + 0.1 * k), 0.5], "frame": "map"}]
     print(
         f"\ngoto over the wire → accepted, seen by the commander ({messages[0]}): median "
@@ -159,9 +159,9 @@ def test_goals_over_the_wire(messages: tuple[str, Path], room: Callable[..., Ros
 def test_cancel(room: Callable[..., RosRoom]) -> None:
     here = room(drive_s=20.0)
     here.goto()
-    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    assert here.run(30.0, lambda: any(report.text == "executing" for report in here.reports))
     here.run_._handle(ev.CancelRequested("bob"))
-    assert here.run(5.0, here.ended)
+    assert here.run(30.0, here.ended)
     assert here.reports[-1].text == "stopped: cancelled by bob"
     assert here.run(1.0, lambda: here.robot.of("ended"))  # it comes by another way
     assert here.robot.of("ended") == [{"ended": "canceled"}]
@@ -170,9 +170,9 @@ def test_cancel(room: Callable[..., RosRoom]) -> None:
 def test_lost_pose_stops_the_robot(room: Callable[..., RosRoom]) -> None:
     here = room(drive_s=20.0)
     here.goto()
-    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    assert here.run(30.0, lambda: any(report.text == "executing" for report in here.reports))
     here.state = TrackState.LOST
-    assert here.run(5.0, here.ended)
+    assert here.run(30.0, here.ended)
     assert here.reports[-1].text == "stopped: bot has lost tracking (LOST)"
     here.robot.forget()
     here.run(1.0)
@@ -182,16 +182,16 @@ def test_lost_pose_stops_the_robot(room: Callable[..., RosRoom]) -> None:
 def test_a_refused_goal(room: Callable[..., RosRoom]) -> None:
     here = room()
     here.goto(500.0, 0.0)
-    assert here.run(15.0, here.ended)
+    assert here.run(30.0, here.ended)
     assert "refuses the goal" in here.reports[-1].text or "no answer" in here.reports[-1].text
 
 
 def test_a_goal_that_fails_says_why(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> None:
     here = room(drive_s=20.0)
     here.goto()
-    assert here.run(10.0, lambda: any(report.text == "executing" for report in here.reports))
+    assert here.run(30.0, lambda: any(report.text == "executing" for report in here.reports))
     here.node.publish_map_odom = lambda *_: None  # type: ignore[method-assign]
-    assert here.run(5.0, here.ended)
+    assert here.run(30.0, here.ended)
     text = "without a reason" if messages[0] == "humble" else "Nav2's error 9002, no transform"
     assert text in here.reports[-1].text
 
@@ -201,7 +201,7 @@ def test_namespace(messages: tuple[str, Path], room: Callable[..., RosRoom]) -> 
         pytest.skip("names are the same in all releases")
     here = room(namespace="tb1")
     here.goto()
-    assert here.run(15.0, here.ended)
+    assert here.run(30.0, here.ended)
     assert here.reports[-1].is_reached
     assert here.node.topics.namespaces_with("navigate_to_pose/_action/status") == []
 
@@ -276,6 +276,8 @@ class Commands:
 
     def start(self, *words: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "share", "robot", *words]
+        if words[0] != "bridge":  # a commander that starts does not take the bridge's computer
+            command = ["nice", "-n", "10", *command]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         self.processes.append(subprocess.Popen(command, env=self.environment, **pipes))
         return self.processes[-1]
@@ -284,7 +286,7 @@ class Commands:
         """Start a bridge and wait until it takes goals."""
         poses = f"udp://127.0.0.1:{self.port}"
         bridge = self.start("bridge", "--robot", str(self.file), "--allow-goals", "--poses", poses)
-        end = time.time() + 20
+        end = time.time() + 60
         while not (self.tmp_path / f"share-robot-{self.domain}.sock").exists():
             assert bridge.poll() is None and time.time() < end
             time.sleep(0.05)
@@ -299,7 +301,7 @@ class Commands:
         watch.kill()
         return bridge
 
-    def wait_for(self, key: str, value: object = None, seconds: float = 15.0) -> None:
+    def wait_for(self, key: str, value: object = None, seconds: float = 60.0) -> None:
         """Wait until the robot says something."""
         end = time.time() + seconds
         while time.time() < end:
@@ -335,7 +337,7 @@ def commands(tmp_path: Path, messages: tuple[str, Path]) -> Iterator[Callable[..
 def test_share_robot_goto(commands: Callable[..., Commands]) -> None:
     here = commands(drive_s=1.0)
     here.start_bridge()
-    out, err = here.start("goto", "1.5", "-0.5", "90", "--json").communicate(timeout=20)
+    out, err = here.start("goto", "1.5", "-0.5", "90", "--json").communicate(timeout=60)
     assert json.loads(out) == {"reached": True, "text": "reached"}, err
 
 
@@ -351,9 +353,9 @@ def test_goto_that_is_killed_stops_the_robot_and_cancel_too(commands: Callable[.
     goto = here.start("goto", "1.0", "0.0")
     here.wait_for("goal")
     time.sleep(0.5)
-    assert here.start("cancel").wait(timeout=10) == 0
+    assert here.start("cancel").wait(timeout=60) == 0
     here.wait_for("ended", "canceled")
-    _, err = goto.communicate(timeout=10)
+    _, err = goto.communicate(timeout=60)
     assert goto.returncode == 1 and "cancelled by `share robot cancel`" in err
 
 
@@ -365,7 +367,7 @@ def test_a_bridge_that_ends_or_dies_leaves_no_goal(commands: Callable[..., Comma
     time.sleep(0.5)
     bridge.send_signal(signal.SIGINT)
     here.wait_for("ended", "canceled")
-    assert bridge.wait(timeout=10) == 0
+    assert bridge.wait(timeout=60) == 0
     here.robot.forget()
     bridge = here.start_bridge()
     here.start("goto", "1.5", "-0.5")

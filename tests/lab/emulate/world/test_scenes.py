@@ -18,13 +18,16 @@ pytestmark = pytest.mark.long
 
 CLEARANCE = 0.45  # m
 SMALL = (9.0, 6.0, 4.0)  # the paper's room
-SEEDS = range(8)
+SEEDS = range(4)
+few_and_more = pytest.mark.parametrize(
+    "seeds", [SEEDS, pytest.param(range(4, 8), marks=pytest.mark.slow)], ids=["few", "more"]
+)
 ROOMS = ("warehouse", "firestation", "corridor-twins", "whitewall")
 
 
 @cache
-def rooms(name: str) -> list[Layout]:
-    return [make_scene_layout(name, seed) for seed in SEEDS]
+def rooms(name: str, seeds: range = SEEDS) -> list[Layout]:
+    return [make_scene_layout(name, seed) for seed in seeds]
 
 
 def free_share(room: Layout) -> tuple[float, float]:
@@ -42,9 +45,10 @@ def described(room: Layout) -> list[tuple[str, bytes, bytes, bytes]]:
     ]
 
 
+@few_and_more
 @pytest.mark.parametrize("name", ROOMS)
-def test_everything_is_inside_the_room(name: str) -> None:
-    for room in rooms(name):
+def test_everything_is_inside_the_room(name: str, seeds: range) -> None:
+    for room in rooms(name, seeds):
         for piece in room.all_pieces:
             low, high = piece.bounding_box
             assert (low >= -2e-3).all(), (room.seed, piece.name)
@@ -65,9 +69,10 @@ def apart(a: F64, b: F64) -> bool:
     return bool(((a[1] <= b[0] + 1e-3) | (a[0] >= b[1] - 1e-3)).any())
 
 
+@few_and_more
 @pytest.mark.parametrize("name", ROOMS)
-def test_solid_things_do_not_pass_through_each_other(name: str) -> None:
-    for room in rooms(name):
+def test_solid_things_do_not_pass_through_each_other(name: str, seeds: range) -> None:
+    for room in rooms(name, seeds):
         solid = [p for p in room.pieces if p.solid]
         carriers = [p for p in room.shell if p.name.split()[0] in ("column", "girder", "pillar")]
         for i, piece in enumerate(solid):
@@ -80,10 +85,11 @@ def touches_wall(piece: Piece, walls: F64) -> bool:
     return any(np.abs(piece.bounding_box[:, int(axis)] - at).min() < 0.02 for axis, at in walls)
 
 
+@few_and_more
 @pytest.mark.parametrize("name", ROOMS)
-def test_nothing_floats(name: str) -> None:
+def test_nothing_floats(name: str, seeds: range) -> None:
     """All stands on the floor, hangs on a wall or under the ceiling."""
-    for room in rooms(name):
+    for room in rooms(name, seeds):
         x, y, z = room.size
         walls = [(0, 0), (0, x), (1, 0), (1, y)]
         if name == "corridor-twins":
