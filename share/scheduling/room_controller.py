@@ -21,7 +21,7 @@ from share.timing import SECOND_NS, seconds_to_ns
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
-UNKNOWN_KEYFRAME_S = 0.06  # default before any measurement: 30 kB at 5 Mbit/s
+UNKNOWN_KEYFRAME_S = 0.03  # default before any measurement: a small picture, 12 kB, at 5 Mbit/s
 MAX_HOLD_S = 2.0  # longer, and a keyframe is stale: rather on a full air
 _LEAST_SLOT_S = 0.002
 
@@ -86,7 +86,8 @@ class RoomController:
     def hold_ms(self, name: str, now_ns: int) -> float:
         """Return how long an agent that joins now holds its keyframes, ms."""
         self._starting[name] = now_ns
-        return self._start.hold_ms(self._keyframe_s / _STARTING_LOAD, now_ns)
+        free = _STARTING_LOAD if self._budget.agents else 1.0  # nobody is there who would be made late
+        return self._start.hold_ms(self._keyframe_s / free, now_ns)
 
     @property
     def _keyframe_s(self) -> float:

@@ -11,7 +11,8 @@ from tool_main import line
 
 from share.lab.evaluate.statistics import bootstrap_mean
 
-HEAD = ("air", "policy", "AR QoE: mean, p5", "by round trip", "robot QoE", "AR corrections p95, ms")
+HEAD = ("air", "policy", "AR QoE: mean, p5", "by round trip", "robot QoE", "factors", "delay")
+HEAD += ("AR corrections p95, ms",)
 HEAD += ("Jain", "a 100 frames", "AR ages: correction p95, pose p99, s", "AR in a shared map, s")
 HEAD += ("cm: AR, robots", "sent Hz: AR, robots", "kB/s", "air", "maps", "took s")
 PAIRED_HEAD = ("air", "against", "seeds", "AR QoE: better in", "difference", "p5: better in", "difference")
@@ -72,6 +73,11 @@ def ar_qoe_p5(row: Row) -> float:
     return float(np.percentile(pooled(row, "ar", "qoe"), 5))
 
 
+def until_acknowledged_ms(row: Row) -> float:
+    """Return the mean delay of headsets until a keyframe is acknowledged, ms."""
+    return float((pooled(row, "ar", "delay_ms") - pooled(row, "ar", "answer_ms")).mean())
+
+
 def error_cm(row: Row, kind: str) -> float:
     """Return the mean over agents of a kind of their error in a shared map, cm; NaN where none was in one."""
     found = [cm for name, cm in row["error_cm"].items() if name.startswith(kind)]
@@ -102,6 +108,10 @@ def cells_of(rows: Sequence[Row]) -> list[str]:
         f"{over_runs(ar_qoe):.3f}, {over_runs(ar_qoe_p5):.3f}",
         f"{over_runs(lambda r: trip(r).mean()):.3f}, {over_runs(lambda r: percentile(trip(r), 5)):.3f}",
         f"{over_runs(lambda r: pooled(r, 'robot', 'qoe').mean()):.3f}",
+        f"{over_runs(lambda r: pooled(r, 'ar', 'qoe_of_delay').mean()):.3f}, "
+        f"{over_runs(lambda r: pooled(r, 'ar', 'qoe_of_error').mean()):.3f}",
+        f"{over_runs(until_acknowledged_ms):.0f}, "
+        f"{over_runs(lambda r: pooled(r, 'ar', 'answer_ms').mean()):.0f}",
         f"{over_runs(lambda r: percentile(pooled(r, 'ar', 'corrected_ms'), 95)):.0f}",
         f"{over_runs(lambda r: jain(mean_qoe(r, 'ar'))):.3f}",
         f"{over_runs(corrections_a_100_frames):.2f}",
