@@ -55,6 +55,19 @@ class Blinding:
         }
 
 
+class NoBlinding:
+    """Covers nothing: of an edge that is in no study."""
+
+    def covered(self, report: dict[str, Any]) -> dict[str, Any]:
+        return report
+
+    def covered_event(self, fields: dict[str, Any]) -> dict[str, Any] | None:
+        return fields
+
+    def covered_series(self, series: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
+        return series
+
+
 def _covered_agent(agent: Mapping[str, Any]) -> dict[str, Any]:
     covered = _emptied(agent, _RATED)
     if covered.get("merges"):

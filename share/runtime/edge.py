@@ -50,7 +50,7 @@ from share.protocol.edge_events import (
 from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
-from share.runtime.blinding import Blinding
+from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
@@ -104,7 +104,7 @@ class EdgeRun:
         allowed: Collection[Permission] = (),
         blinding: Blinding | None = None,
     ) -> None:
-        self._allowed, self._blinding = frozenset(allowed), blinding
+        self._allowed, self._blinding = frozenset(allowed), blinding or NoBlinding()
         self._settings, self._link, self._on_record = settings, link, on_record
         self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
@@ -141,10 +141,7 @@ class EdgeRun:
         finally:
             self.close()
             self._try_to_report()
-            series = self._state_machine.series()
-            self._report["series"] = (
-                series if self._blinding is None else self._blinding.covered_series(series)
-            )
+            self._report["series"] = self._blinding.covered_series(self._state_machine.series())
             self._files.finish(self._report)
             self._discard_answers()
             self._files.check()
@@ -192,8 +189,7 @@ class EdgeRun:
         map_trouble = None if self._map_writer is None else self._map_writer.trouble
         current = (map_trouble, self._files.trouble, self._progress.stall(), self._link.trouble())
         report = self._totals.with_totals(self._state_machine.report(self._progress.report))
-        if self._blinding is not None:
-            report = self._blinding.covered(report)
+        report = self._blinding.covered(report)
         self._report = {
             **report,
             "refused": [*self._other_troubles.current(), *report["refused"]],
@@ -345,7 +341,7 @@ class EdgeRun:
             self._execute(effect)
 
     def _execute(self, effect: EdgeEffect) -> None:
-        if isinstance(effect, WriteEvent) and self._blinding is not None:
+        if isinstance(effect, WriteEvent):
             fields = self._blinding.covered_event(effect.fields)
             if fields is None:
                 return

@@ -38,21 +38,23 @@ def test_a_plan_and_its_key(study):
     done = study("plan", "--out", "s")
     assert done.code == 0
     assert "each condition in each place: 5 times" in done.out and "20 different orders of 20" in done.out
-    assert sorted(path.name for path in Path("s").iterdir()) == ["plan.json"]
+    assert sorted(path.name for path in Path("s").iterdir()) == ["floor.png", "plan.json"]
+    assert "round and round at 0.5 m/s: 12.0 m, 24 s a round" in done.out
     assert stat.S_IMODE(Path("s-key.json").stat().st_mode) == 0o600
     assert len(read_plan(Path("s")).spots) == 10
 
 
-@pytest.mark.parametrize("kept", ["s/plan.json", "s-key.json"])
+@pytest.mark.parametrize("kept", ["s/plan.json", "s/floor.png", "s-key.json"])
 def test_nothing_is_overwritten(study, kept):
     planned(study)
-    for path in {"s/plan.json", "s-key.json"} - {kept}:
+    names = "s/plan.json", "s/floor.png", "s-key.json"
+    for path in set(names) - {kept}:
         Path(path).unlink()
-    text = Path(kept).read_text()
+    content = Path(kept).read_bytes()
     done = study("plan", "--out", "s")
     assert done.code == 2 and f"{kept}: exists and is not overwritten" in done.err
-    assert Path(kept).read_text() == text
-    assert [path for path in ("s/plan.json", "s-key.json") if Path(path).exists()] == [kept]
+    assert Path(kept).read_bytes() == content
+    assert [path for path in names if Path(path).exists()] == [kept]
 
 
 @pytest.mark.parametrize(
