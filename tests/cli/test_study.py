@@ -306,6 +306,7 @@ def test_too_few_participants_have_figures_and_no_tests(study, ratings):
     ratings.write_text("".join(lines[:7]).replace("rating", "a|b"))
     done = study("analyze", ratings, "--out", "report")
     assert done.code == 0 and "2 of 2 participants are complete: too few for tests, which want 3" in done.out
+    assert done.out.count("are complete") == 1
     (row, _) = csv.DictReader(Path("report/tests.csv").read_text().splitlines())
     assert (row["n"], row["Friedman p"], row["slope a place high"]) == ("2", "", "") and None not in row
     assert "<td>a|b</td>" in Path("report/report.html").read_text()

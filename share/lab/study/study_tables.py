@@ -159,17 +159,27 @@ def _needed_text(power: NextStudy) -> str:
     return f"{needed} ({worst} at the interval's lower end)"
 
 
+def _incomplete_lines(study: StudyAnalysis) -> list[str]:
+    """Say of which measures some participants are missing, or too few are there; a line for each number."""
+    names = dict[int, list[str]]()
+    for one in study.measures:
+        if one.complete < max(study.participants, MIN_COMPLETE):
+            names.setdefault(one.complete, []).append(one.name)
+    lines = []
+    for complete, of in names.items():
+        what = "all measures" if len(of) == len(study.measures) > 1 else "; ".join(of)
+        few = "" if complete >= MIN_COMPLETE else f": too few for tests, which want {MIN_COMPLETE}"
+        lines.append(f"{what}: {complete} of {study.participants} participants are complete{few}")
+    return lines
+
+
 def coverage_lines(study: StudyAnalysis) -> list[str]:
     """Say how much of the study there is, how the orders were balanced, and what a reader must know."""
-    lines = [f"{study.participants} participants, conditions {', '.join(study.conditions)}"]
+    people = f"{study.participants} participant{'s' * (study.participants != 1)}"
+    lines = [f"{people}, conditions {', '.join(study.conditions)}"]
     if study.done < study.planned:
         lines.append(f"NOT THE WHOLE STUDY: {study.done} of {study.planned} trials")
-    lines += [
-        f"{one.name}: {one.complete} of {study.participants} participants are complete"
-        + ("" if one.complete >= MIN_COMPLETE else f": too few for tests, which want {MIN_COMPLETE}")
-        for one in study.measures
-        if one.complete < max(study.participants, MIN_COMPLETE)
-    ]
+    lines += _incomplete_lines(study)
     if study.balance is not None:
         lines += [f"orders as carried out: {line}" for line in study.balance.lines(list(study.conditions))]
     return [*lines, *study.notes]
