@@ -1,8 +1,8 @@
 """Results of mapping steps that are pure functions of what they are given, kept to be used again.
 
-In a simulation agents that replay one recording send the same keyframes, and so do people's headsets under one
-policy after another. Finding features in an image and verifying two keyframes by theirs give the same each
-time; what it costs in virtual time is drawn all the same.
+In a simulation agents that replay one recording send the same keyframes, and so do people's headsets under
+one policy after another. Finding features in an image and verifying two keyframes by theirs give the same
+each time; what it costs in virtual time is drawn all the same.
 """
 
 from __future__ import annotations

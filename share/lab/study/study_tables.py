@@ -160,17 +160,21 @@ def _needed_text(power: NextStudy) -> str:
 
 
 def _incomplete_lines(study: StudyAnalysis) -> list[str]:
-    """Say of which measures some participants are missing, or too few are there; a line for each number."""
-    names = dict[int, list[str]]()
-    for one in study.measures:
-        if one.complete < max(study.participants, MIN_COMPLETE):
-            names.setdefault(one.complete, []).append(one.name)
-    lines = []
-    for complete, of in names.items():
-        what = "all measures" if len(of) == len(study.measures) > 1 else "; ".join(of)
+    """Say of which measures some participants are missing, or too few are there."""
+
+    def said(complete: int) -> str:
         few = "" if complete >= MIN_COMPLETE else f": too few for tests, which want {MIN_COMPLETE}"
-        lines.append(f"{what}: {complete} of {study.participants} participants are complete{few}")
-    return lines
+        return f"{complete} of {study.participants} participants are complete{few}"
+
+    found = [
+        (one.name, one.complete)
+        for one in study.measures
+        if one.complete < max(study.participants, MIN_COMPLETE)
+    ]
+    counts = {complete for _, complete in found}
+    if len(found) == len(study.measures) > 1 and len(counts) == 1:
+        return [f"all measures: {said(counts.pop())}"]
+    return [f"{name}: {said(complete)}" for name, complete in found]
 
 
 def coverage_lines(study: StudyAnalysis) -> list[str]:

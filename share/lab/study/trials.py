@@ -139,7 +139,7 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
             else:
                 raise DataError(f"{where}: event '{kind!s:.40}' is not known")
             record.is_left = event.get("is_left") is True
-            record.last_s = max(record.last_s, _number(event["t_s"]))
+            record.last_s = max(record.last_s, _number(event.get("t_s", 0.0)))
     if record.is_complete and len(record.goals) != len(plan.spots):
         raise DataError(
             f"{path}: says that it is complete, with {len(record.goals)} of {len(plan.spots)} goals"
