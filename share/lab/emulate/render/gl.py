@@ -156,8 +156,8 @@ class GlRoom:
     def image(self, camera: Camera, instant: SceneInstant) -> F32:
         """Return (H, W) gray levels, one sample a pixel: aliased on its own, see above. Read-only."""
         views = list(self._visible_pieces(camera, instant))
-        lamp = _MOVER_LAMP @ instant.T_world_cam[:3, :3]
-        lamps = [None if view[0] is self._room else (view[1][:3, :3] @ lamp).astype("f4") for view in views]
+        to_lamp = _MOVER_LAMP @ instant.T_world_cam[:3, :3]
+        lamps = [None if piece is self._room else (T[:3, :3] @ to_lamp).astype("f4") for piece, T, _ in views]
         key = camera, *(_drawn_bytes(*view, lamp) for view, lamp in zip(views, lamps, strict=True))
         if key in self._recent:
             self._recent.move_to_end(key)
