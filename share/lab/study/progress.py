@@ -68,7 +68,7 @@ class StudyProgress:
 def read_progress(folder: Path, plan: StudyPlan) -> StudyProgress:
     """Return how far a study is. Raises DataError for trials or answers that are not the plan's."""
     records = read_trials(folder, plan)  # checks them, too
-    answered, chosen = _read_answered(folder / ANSWERS)
+    answered, chosen = _read_answered(folder / ANSWERS, plan)
     steps = {}
     for person in plan.participants:
         left: list[StudyStep] = []
@@ -91,14 +91,20 @@ def read_progress(folder: Path, plan: StudyPlan) -> StudyProgress:
     return StudyProgress(plan, steps)
 
 
-def _read_answered(path: Path) -> tuple[set[tuple[str, str]], set[str]]:
+def _read_answered(path: Path, plan: StudyPlan) -> tuple[set[tuple[str, str]], set[str]]:
     """Return who has answered after which condition, and who has chosen. Raises DataError."""
     answered, chosen = set[tuple[str, str]](), set[str]()
+    people = {one.name for one in plan.participants}
     for number, row in enumerate(read_json_lines(path, MAX_LINES_BYTES) if path.exists() else [], 1):
-        with own_format_errors(Path(f"{path}, line {number}")):
-            person = str(row["participant"])
+        where = f"{path}, line {number}"
+        with own_format_errors(Path(where)):
+            person = row["participant"]
+            if person not in people:
+                raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
             if "answers" in row:
-                answered.add((person, str(row["condition"])))
+                if row["condition"] not in plan.letters:
+                    raise DataError(f"{where}: condition {row['condition']!s:.40} is not in the plan")
+                answered.add((person, row["condition"]))
             else:
                 chosen.add(person)
     return answered, chosen
