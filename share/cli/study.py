@@ -124,14 +124,16 @@ def plan(
     """Draw who meets which condition when, by letters, and write the key to the letters to a file apart.
 
     Orders are balanced for place and carry-over; each trial has an order of its spots of its own. DIR gets
-    plan.json. Whoever is to stay blind must not see the key. --seed draws the same spots and orders again,
-    never the same letters: these are drawn by a secret of the key. Nothing is ever overwritten.
+    plan.json and floor.png, a picture of spots and path. Whoever is to stay blind must not see the key.
+    --seed draws the same spots and orders again, never the same letters: these are drawn by a secret of the
+    key. Nothing is ever overwritten.
 
     \b
     Example:  share study plan --participants 20 --out study
     """
     import numpy as np
 
+    from share.lab.study.floor_plan import FLOOR_PICTURE, walk_line
     from share.lab.study.plan import (
         PAPER_POLICIES,
         PLAN,
@@ -147,7 +149,7 @@ def plan(
     if min(space) <= 0:
         raise UsageError(f"--space {space[0]:g}x{space[1]:g}: both must be positive")
     plan_path, key_path = out / PLAN, key_file or out.with_name(f"{out.name}-key.json")
-    for path in (plan_path, key_path):
+    for path in (plan_path, key_path, out / FLOOR_PICTURE):
         if path.exists():
             raise UsageError(f"{path}: exists and is not overwritten; give a new --out or --key")
     if key_path.resolve().is_relative_to(out.resolve()):
@@ -167,23 +169,29 @@ def plan(
     _write_plan(plan_path, key_path, drawn, key.text())
     for line in drawn.balance.lines(list(drawn.letters)):
         click.echo(line)
+    click.echo(walk_line(drawn))
     click.echo(
-        f"plan: {plan_path} (letters only); key: {key_path} (give it to somebody who is not in the room)"
+        f"plan: {plan_path} (letters only); spots and path: {out / FLOOR_PICTURE}; key: {key_path} (give it "
+        "to somebody who is not in the room)"
     )
 
 
 def _write_plan(plan_path: Path, key_path: Path, plan: StudyPlan, key_text: str) -> None:
-    """Write both files, or none."""
+    """Write both files and the picture of the floor, or none."""
     from share.files.writing import check_writable, new_file, write_private
+    from share.lab.study.floor_plan import FLOOR_PICTURE, draw_floor
     from share.lab.study.plan import plan_text
 
     check_writable(plan_path)
+    picture = plan_path.with_name(FLOOR_PICTURE)
     write_private(check_writable(key_path), key_text)
     try:
+        draw_floor(picture, plan)
         with new_file(plan_path) as file:
             file.write(plan_text(plan).encode())
     except BaseException:
-        key_path.unlink(missing_ok=True)  # ours, of a plan that does not exist
+        for ours in (key_path, picture):  # of a plan that does not exist
+            ours.unlink(missing_ok=True)
         raise
 
 

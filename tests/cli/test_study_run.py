@@ -79,6 +79,22 @@ def test_an_edited_plan_and_a_swapped_key_are_refused(study: Run) -> None:
     assert done.code == 2 and "is not the key that this plan was sealed with" in done.err
 
 
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ({"participant": ["p01"], "most": "A"}, "is damaged, or of another version"),
+        ({"participant": "p99", "most": "A"}, "participant p99 is not in the plan"),
+        ({"participant": "p01", "condition": "Z", "answers": {}}, "condition Z is not in the plan"),
+        ({"most": "A"}, "is damaged, or of another version"),
+    ],
+)
+def test_answers_that_are_not_the_plans_are_refused(study: Run, row: dict[str, Any], says: str) -> None:
+    write_lines(Path("s/answers.jsonl"), [row])
+    done = study("s")
+    assert done.code == 1 and "answers.jsonl, line 1" in done.err and says in done.err, done.err
+    assert done.err.count("\n") == 1
+
+
 def test_no_blind_trial_follows_the_unblinding(study: Run, share: Run) -> None:
     assert share("study", "unblind", "s", "--key", "s-key.json", "--early").code == 0
     done = study("s")

@@ -23,6 +23,7 @@ from share.types import F32, F64, I64, U8, Frame, ImuBatch
 MARGIN_NS = seconds_to_ns(0.02)  # the path has to be known so long after a frame: half an exposure, IMU
 _EXPOSURE_FRAMES = 40  # from which the next exposure follows
 _METER_FACTOR = 8
+_STEADY_PX = 0.01  # half the renderer's own error; fans shake a robot that stands by a fifth of it
 
 Others = Callable[[I64], list[dict[str, F64]]]  # parts of other agents at each of session times (N,)
 
@@ -48,6 +49,7 @@ class RobotSensors:
         self._imu_errors = device.imu_errors(seconds + 1.0)
         self._recent: deque[tuple[int, float]] = deque(maxlen=_EXPOSURE_FRAMES)  # true time, brightness
         self._imu_until_ns = START_NS  # stamp of the newest sample that a frame has
+        self._drawn_from: F64 | None = None  # pose of the body at the newest sharp picture that was drawn
         self.sees_bare_wall = False
 
     @property
@@ -104,7 +106,19 @@ class RobotSensors:
         motion_px = float(image_motion_px(self.rig, first[None], last[None])[0])
         offsets = self._device.blur_offsets(shot, motion_px)
         times = np.maximum(true_ns + np.rint(offsets * 1e9).astype(np.int64), first_ns)
-        return list(zip(path.poses(times), self._others(times - START_NS), strict=True))
+        poses = path.poses(times)
+        if len(poses) == 1:
+            poses = self._steady(poses)
+        return list(zip(poses, self._others(times - START_NS), strict=True))
+
+    def _steady(self, pose: F64) -> F64:
+        """Return the pose (1, 4, 4) of the picture before where this one moves by less than _STEADY_PX: what
+        is drawn from the same pose is drawn once."""
+        before = self._drawn_from
+        if before is None or float(image_motion_px(self.rig, before, pose)[0]) >= _STEADY_PX:
+            self._drawn_from = pose
+            return pose
+        return before
 
     def _imu(self, true_ns: int, stamp_ns: int) -> ImuBatch:
         """Return the samples since the frame before, up to the first one not before this frame."""

@@ -107,7 +107,7 @@ class Balance:
             if i != j
         ]
         return [
-            f"{self.distinct} different orders of {int(self.places[0].sum())}",
+            f"{self.distinct} different order{'s' * (self.distinct > 1)} of {int(self.places[0].sum())}",
             _counts_line("each condition in each place", places),
             _counts_line("each condition right after each other", pairs),
         ]
@@ -123,7 +123,7 @@ def _counts_line(what: str, counts: list[tuple[str, int]]) -> str:
         for count in sorted(tally)
         if count != usual
     ]
-    return f"{what}: {_times(usual)}, but NOT BALANCED: {'; '.join(groups)}"
+    return f"{what}: NOT BALANCED: mostly {_times(usual)}; {'; '.join(groups)}"
 
 
 def _times(count: int) -> str:

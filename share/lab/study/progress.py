@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from share.errors import DataError, UsageError
 from share.files.json_file import own_format_errors, read_json_lines
 from share.lab.study.plan import ANSWERS, Participant, StudyPlan
-from share.lab.study.trials import EVENTS, MAX_LINES_BYTES, read_trials, trial_folder
+from share.lab.study.trials import MAX_LINES_BYTES, read_trials
 
 
 @dataclass(frozen=True)
@@ -70,23 +68,20 @@ class StudyProgress:
 def read_progress(folder: Path, plan: StudyPlan) -> StudyProgress:
     """Return how far a study is. Raises DataError for trials or answers that are not the plan's."""
     records = read_trials(folder, plan)  # checks them, too
-    answers = _read_rows(folder / ANSWERS)
-    answered = {(row.get("participant"), row.get("condition")) for row in answers if "answers" in row}
-    chosen = {row.get("participant") for row in answers if "most" in row or "least" in row}
+    answered, chosen = _read_answered(folder / ANSWERS, plan)
     steps = {}
     for person in plan.participants:
         left: list[StudyStep] = []
         carried: dict[int, str] = {}
         for place, trial in enumerate(person.trials, 1):
             record = records.get((person.name, place))
-            end = _trial_end(trial_folder(folder, person.name, place) / EVENTS)
-            if end.is_left:
+            if record is None:
+                left.append(TrialStep(place, trial.condition, frozenset(), False, 0.0))
+            elif record.is_left:
                 continue
-            if record is None or not record.is_complete:
-                done = frozenset(
-                    number for number, goal in (record.goals if record else {}).items() if goal.has_ended
-                )
-                left.append(TrialStep(place, trial.condition, done, record is not None, end.last_s))
+            elif not record.is_complete:
+                done = frozenset(number for number, goal in record.goals.items() if goal.has_ended)
+                left.append(TrialStep(place, trial.condition, done, True, record.last_s))
             carried[place] = trial.condition
             if (person.name, trial.condition) not in answered:
                 left.append(AnswerStep(place, trial.condition))
@@ -96,23 +91,23 @@ def read_progress(folder: Path, plan: StudyPlan) -> StudyProgress:
     return StudyProgress(plan, steps)
 
 
-@dataclass(frozen=True)
-class _TrialEnd:
-    last_s: float = 0.0
-    is_left: bool = False
-
-
-def _trial_end(path: Path) -> _TrialEnd:
-    """Return what the last line of a trial tells."""
-    rows = _read_rows(path)
-    if not rows:
-        return _TrialEnd()
-    with own_format_errors(path):
-        return _TrialEnd(max(float(row["t_s"]) for row in rows), rows[-1].get("is_left") is True)
-
-
-def _read_rows(path: Path) -> list[Mapping[str, Any]]:
-    return list(read_json_lines(path, MAX_LINES_BYTES)) if path.exists() else []
+def _read_answered(path: Path, plan: StudyPlan) -> tuple[set[tuple[str, str]], set[str]]:
+    """Return who has answered after which condition, and who has chosen. Raises DataError."""
+    answered, chosen = set[tuple[str, str]](), set[str]()
+    people = {one.name for one in plan.participants}
+    for number, row in enumerate(read_json_lines(path, MAX_LINES_BYTES) if path.exists() else [], 1):
+        where = f"{path}, line {number}"
+        with own_format_errors(Path(where)):
+            person = row["participant"]
+            if person not in people:
+                raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
+            if "answers" in row:
+                if row["condition"] not in plan.letters:
+                    raise DataError(f"{where}: condition {row['condition']!s:.40} is not in the plan")
+                answered.add((person, row["condition"]))
+            else:
+                chosen.add(person)
+    return answered, chosen
 
 
 def left_goals(step: TrialStep, person: Participant, plan: StudyPlan) -> list[tuple[int, int]]:

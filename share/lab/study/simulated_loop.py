@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 from share.geometry.camera import Rig
 from share.lab.emulate.types import START_NS
 from share.lab.evaluate.emulated_network import NetworkModel
+from share.lab.evaluate.kept_steps import KeptSteps
 from share.lab.evaluate.simulation import TrackedFrame
 from share.lab.robot.loop import ROBOT, Member, RobotLoop
 from share.lab.robot.planner import RoomGrid
@@ -27,6 +29,11 @@ _REPLAY_STEP_S = 1.7  # between the beginnings of two
 class StudyLoop(RobotLoop):
     """Commands go from a headset to the edge, and on to the robot; answers the way back. Each is one message,
     behind what its device has sent before."""
+
+    kept_steps = KeptSteps()  # of all trials of a process
+
+    def _run_step(self, step: Any) -> object:
+        return self.kept_steps.run(step)
 
     @property
     def grid(self) -> RoomGrid:

@@ -8,7 +8,6 @@ own headset counts as the robot's does.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,16 +17,15 @@ from share.lab.robot.loop import transform_between
 from share.lab.robot.planner import Costmap
 from share.lab.study.simulated_loop import StudyLoop
 from share.lab.study.simulated_room import PlannedCall
+from share.lab.study.standstill import BY_TRUTH, MotionWatch, RobotSample
 from share.robot import robot_events as ev
 from share.robot.goal_control import GOAL_PREFIX
-from share.robot.planar import PlanarPose, wrapped
+from share.robot.planar import PlanarPose
 from share.types import F64
 
 _AGAIN_S = 1.0  # after it hears that the robot does not come
 _UNANSWERED_S = 5.0  # after a press of which it hears nothing
 _STANDS_S = 3.0  # before the first call
-_STILL_S, _STILL_M, _STILL_RAD = 0.5, 0.005, 0.01  # a robot stands that moved less for so long
-_MOVED_M, _MOVED_RAD = 0.02, 0.05  # its first motion
 _TICK_S = 0.1
 _STATUSES = ("reached", "succeeded"), ("the robot gave up", "aborted"), ("refused", "refused")
 
@@ -64,9 +62,9 @@ class SimulatedParticipant:
         self._next_press_s = 0.0
         self._cube_in_map: tuple[PlanarPose, str | None] | None = None
         self._status = "none"
-        self._began: tuple[int, PlanarPose] = (0, PlanarPose(0.0, 0.0, 0.0))
+        self._began_ns = 0
+        self._watch = MotionWatch(None, BY_TRUTH)
         self._has_moved = False
-        self._recent: deque[PlanarPose] = deque(maxlen=round(_STILL_S / _TICK_S) + 1)
         self._stood = False  # and that is written down
         self._ticks = 0
         loop.on_report, loop.on_trace = self._pass_report_on, self._tick
@@ -76,14 +74,13 @@ class SimulatedParticipant:
     def _tick(self) -> None:
         now_s = self._loop.now_ns / 1e9
         here = self._loop.base.at(self._loop.now_ns).T_world_base
-        self._recent.append(here)
         self._ticks += 1
         if self._ticks % round(1 / _TICK_S) == 0:
             self._compare_maps(now_s, here)
         if self._number == 0:
             self._set_up(now_s, here)
         else:
-            self._watch(now_s, here)
+            self._watch_robot(now_s, here)
         next_s = self._calls[self._number].t_s if self._number < len(self._calls) else self._end_s
         if now_s >= next_s:
             self._go_on(now_s, here)
@@ -115,20 +112,17 @@ class SimulatedParticipant:
         goal = place @ here.inverse() @ self._draw(here)
         self._loop.to_bridge(self._request(goal, map_id))
 
-    def _watch(self, now_s: float, here: PlanarPose) -> None:
+    def _watch_robot(self, now_s: float, here: PlanarPose) -> None:
         """Write down the first motion, and where the robot stands."""
-        began_ns, before = self._began
-        moved = here.distance_m(before) > _MOVED_M or abs(wrapped(here.yaw - before.yaw)) > _MOVED_RAD
-        if moved and not self._has_moved:
+        self._watch.add(_sample(now_s, here))
+        if self._watch.moves_s is not None and not self._has_moved:
             self._has_moved = True
             self._write(now_s, "moves", goal=self._number)
-        oldest = self._recent[0]
-        stands = len(self._recent) == self._recent.maxlen
-        stands = stands and here.distance_m(oldest) < _STILL_M
-        stands = stands and abs(wrapped(here.yaw - oldest.yaw)) < _STILL_RAD
-        if stands and not self._stood and (self._has_moved or self._is_over):
-            self._write_stop(max(now_s - _STILL_S, began_ns / 1e9), here)
-        self._stood = stands and (self._stood or self._has_moved or self._is_over)
+        since_s = self._watch.stands_since()
+        counts = since_s is not None and (self._has_moved or self._is_over)
+        if since_s is not None and counts and not self._stood:
+            self._write_stop(since_s, here)
+        self._stood = counts
 
     def _write_stop(self, t_s: float, here: PlanarPose) -> None:
         place, map_id = self._loop.place
@@ -136,7 +130,7 @@ class SimulatedParticipant:
         by_map_m = None
         if place is not None and cube is not None and cube[1] == map_id:
             by_map_m = round(place.distance_m(cube[0]), 4)
-        path_m = self._loop.base.driven_m(self._began[0], self._loop.now_ns)
+        path_m = self._loop.base.driven_m(self._began_ns, self._loop.now_ns)
         where = {"robot_m": _xy(here), "path_m": round(path_m, 4), "by_map_m": by_map_m}
         self._write(t_s, "stands", goal=self._number, **where)
 
@@ -150,7 +144,7 @@ class SimulatedParticipant:
 
     def _call(self, now_s: float, here: PlanarPose) -> None:
         call = self._calls[self._number - 1]
-        self._began = self._loop.now_ns, here
+        self._began_ns, self._watch = self._loop.now_ns, MotionWatch(_sample(now_s, here), BY_TRUTH)
         self._has_moved = self._stood = self._is_over = self._is_under_way = False
         self._status, self._cube_in_map = "none", None
         cube = {"spot": call.spot, "cube_m": [round(call.x, 4), round(call.y, 4)]}
@@ -212,6 +206,10 @@ class SimulatedParticipant:
 
     def _write(self, t_s: float, event: str, **fields: Any) -> None:
         self.events.append({"t_s": round(t_s, 3), "event": event, **fields})
+
+
+def _sample(t_s: float, pose: PlanarPose) -> RobotSample:
+    return RobotSample(t_s, pose.x, pose.y, pose.yaw)
 
 
 def _status_of(report: ev.GoalReport) -> str:

@@ -28,6 +28,7 @@ from share.lab.evaluate.virtual_time import track_session
 from share.lab.robot.base import RobotBase
 from share.lab.robot.drive import DriveModel
 from share.lab.robot.goals import drawn_goals, start_pose
+from share.lab.robot.loop import Member
 from share.lab.robot.room import EmulatedRoom, open_room
 from share.lab.robot.simulate import (
     ROBOT_RUN,
@@ -97,9 +98,10 @@ class SimulatedTrial:
         robot, network = usual_robot(), load_network(settings.network)
         start = start_pose(room.grid, room.people_at(0), rngs[0])
         base = RobotBase(DriveModel(), room.grid, start, inverse(robot.T_body_base), seconds, rngs[1])
-        members = tracked_people(session, room, config, network, no_progress)
-        if settings.agents > OWN_AGENTS:
-            members += replayed_members(*_others(study.folder), settings.agents - OWN_AGENTS, network)
+        replayed: list[Member] = []
+        if settings.agents > OWN_AGENTS:  # first: what is tracked last is kept for the next condition
+            replayed = replayed_members(*_others(study.folder), settings.agents - OWN_AGENTS, network)
+        members = [*tracked_people(session, room, config, network, no_progress), *replayed]
         sensors = robot_sensors(room, base, profile_of_mode(settings.mode), seed, seconds)
         agent = EmulatedRobotAgent(sensors, config, ROBOT_RUN, lambda text: self.loop.note(f"agent: {text}"))
         self.loop = StudyLoop(

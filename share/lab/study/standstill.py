@@ -1,6 +1,7 @@
 """When a robot began to move and since when it stands, from its places a few times a second.
 
-Corrections of the map move a robot that stands by centimetres: less than MOVED_M is no motion.
+Corrections of the map move a robot that stands by centimetres: by the map, less than MotionLimits has is no
+motion.
 """
 
 from __future__ import annotations
@@ -9,10 +10,29 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-MOVED_M, TURNED_RAD = 0.05, 0.15  # from where it was called: it has begun to move
-STILL_M, STILL_RAD, STILL_S = 0.03, 0.1, 1.0  # within these for so long: it stands
-COUNTED_M = 0.03  # of a way; less is noise
-MAX_GAP_S = 1.5  # between two places, over which nothing is said to have stood
+_ROUNDING_S = 1e-6
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """What is motion, and what a standstill; the defaults: of places by a map, some five a second.
+
+    moved_m, turned_rad: from where it was called, beyond one of which it has begun to move. still_m,
+    still_rad, still_s: within the first two for so long, it stands. counted_m: of a way; less is noise.
+    max_gap_s: between two places, over which nothing is said to have stood.
+    """
+
+    moved_m: float = 0.05
+    turned_rad: float = 0.15
+    still_m: float = 0.03
+    still_rad: float = 0.1
+    still_s: float = 1.0
+    counted_m: float = 0.03
+    max_gap_s: float = 1.5
+
+
+BY_MAP = MotionLimits()
+BY_TRUTH = MotionLimits(moved_m=0.02, turned_rad=0.05, still_m=0.005, still_rad=0.01, still_s=0.5)
 
 
 @dataclass(frozen=True)
@@ -32,7 +52,8 @@ class RobotSample:
 class MotionWatch:
     """Follows the robot from a call on. moves_s: its first motion; None before. path_m: driven since."""
 
-    def __init__(self, at_call: RobotSample | None) -> None:
+    def __init__(self, at_call: RobotSample | None, limits: MotionLimits = BY_MAP) -> None:
+        self._limits = limits
         self.moves_s: float | None = None
         self.path_m = 0.0
         self._begin = self._counted = at_call
@@ -46,23 +67,26 @@ class MotionWatch:
 
     def add(self, sample: RobotSample) -> None:
         """Take the next place."""
+        limits = self._limits
         if self._begin is None:  # where it stood at the call is not known: from its first place on
             self._begin = self._counted = sample
-        if self.moves_s is None and not sample.is_near(self._begin, MOVED_M, TURNED_RAD):
+        if self.moves_s is None and not sample.is_near(self._begin, limits.moved_m, limits.turned_rad):
             self.moves_s = sample.t_s
         counted = self._counted or sample
         step_m = math.hypot(sample.x - counted.x, sample.y - counted.y)
-        if step_m >= COUNTED_M:
+        if step_m >= limits.counted_m:
             self.path_m += step_m
             self._counted = sample
-        if self._recent and sample.t_s - self._recent[-1].t_s > MAX_GAP_S:
+        if self._recent and sample.t_s - self._recent[-1].t_s > limits.max_gap_s:
             self._recent.clear()
         self._recent.append(sample)
-        while not self._recent[0].is_near(sample, STILL_M, STILL_RAD):
+        while not self._recent[0].is_near(sample, limits.still_m, limits.still_rad):
             self._recent.popleft()
 
     def stands_since(self) -> float | None:
         """Return since when it stands; None while it does not, or not for long enough."""
-        if not self._recent or self._recent[-1].t_s - self._recent[0].t_s < STILL_S:
+        if not self._recent:
             return None
-        return self._recent[0].t_s
+        since_s = self._recent[0].t_s
+        lasts = self._recent[-1].t_s - since_s >= self._limits.still_s - _ROUNDING_S
+        return since_s if lasts else None

@@ -46,6 +46,8 @@ def draw_measures(path: Path, study: StudyAnalysis, table: Observations) -> None
         axis.set_title(_label(measure.name), fontsize=9)
         axis.grid(axis="y", alpha=0.3)
         axis.set_axisbelow(True)
+        if all(one.least == one.greatest == 0 for one in measure.conditions if one.count):
+            axis.set_ylim(0, 1)  # nothing to be seen, and not below zero
     for axis in axes.ravel()[len(study.measures) :]:
         axis.set_visible(False)
     save_png(figure, path, 110)

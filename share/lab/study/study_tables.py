@@ -159,17 +159,31 @@ def _needed_text(power: NextStudy) -> str:
     return f"{needed} ({worst} at the interval's lower end)"
 
 
-def coverage_lines(study: StudyAnalysis) -> list[str]:
-    """Say how much of the study there is, how the orders were balanced, and what a reader must know."""
-    lines = [f"{study.participants} participants, conditions {', '.join(study.conditions)}"]
-    if study.done < study.planned:
-        lines.append(f"NOT THE WHOLE STUDY: {study.done} of {study.planned} trials")
-    lines += [
-        f"{one.name}: {one.complete} of {study.participants} participants are complete"
-        + ("" if one.complete >= MIN_COMPLETE else f": too few for tests, which want {MIN_COMPLETE}")
+def _incomplete_lines(study: StudyAnalysis) -> list[str]:
+    """Say of which measures some participants are missing, or too few are there."""
+
+    def said(complete: int) -> str:
+        few = "" if complete >= MIN_COMPLETE else f": too few for tests, which want {MIN_COMPLETE}"
+        return f"{complete} of {study.participants} participants are complete{few}"
+
+    found = [
+        (one.name, one.complete)
         for one in study.measures
         if one.complete < max(study.participants, MIN_COMPLETE)
     ]
+    counts = {complete for _, complete in found}
+    if len(found) == len(study.measures) > 1 and len(counts) == 1:
+        return [f"all measures: {said(counts.pop())}"]
+    return [f"{name}: {said(complete)}" for name, complete in found]
+
+
+def coverage_lines(study: StudyAnalysis) -> list[str]:
+    """Say how much of the study there is, how the orders were balanced, and what a reader must know."""
+    people = f"{study.participants} participant{'s' * (study.participants != 1)}"
+    lines = [f"{people}, conditions {', '.join(study.conditions)}"]
+    if study.done < study.planned:
+        lines.append(f"NOT THE WHOLE STUDY: {study.done} of {study.planned} trials")
+    lines += _incomplete_lines(study)
     if study.balance is not None:
         lines += [f"orders as carried out: {line}" for line in study.balance.lines(list(study.conditions))]
     return [*lines, *study.notes]

@@ -73,7 +73,8 @@ class TrialRecord:
     """What happened in a trial. is_complete: it was carried through. repeated: calls at each spot that a
     later call of the same goal replaced. unwell: what was not well when it began; seals: digests of its
     edges' configurations. moved_cubes: goals whose cube moved after it called; moved_floors: how often the
-    marker did."""
+    marker did. is_left: the researcher has left it for good; last_s: time of its last event, on its own
+    clock."""
 
     condition: str
     judge: str
@@ -84,6 +85,8 @@ class TrialRecord:
     seals: set[str] = field(default_factory=set)
     moved_cubes: set[int] = field(default_factory=set)
     moved_floors: int = 0
+    is_left: bool = False
+    last_s: float = 0.0
 
 
 def trial_folder(study: Path, participant: str, place: int) -> Path:
@@ -135,6 +138,8 @@ def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condit
                 _READERS[kind](record, event, plan)
             else:
                 raise DataError(f"{where}: event '{kind!s:.40}' is not known")
+            record.is_left = event.get("is_left") is True
+            record.last_s = max(record.last_s, _number(event.get("t_s", 0.0)))
     if record.is_complete and len(record.goals) != len(plan.spots):
         raise DataError(
             f"{path}: says that it is complete, with {len(record.goals)} of {len(plan.spots)} goals"

@@ -60,8 +60,8 @@ def test_what_is_not_balanced_is_said_exactly() -> None:
     lines = Balance.of(np.array([[0, 1], [1, 0], [0, 1]])).lines(["A", "B"])
     assert lines == [
         "2 different orders of 3",
-        "each condition in each place: once, but NOT BALANCED: twice: A in place 1, B in place 2",
-        "each condition right after each other: once, but NOT BALANCED: twice: B right after A",
+        "each condition in each place: NOT BALANCED: mostly once; twice: A in place 1, B in place 2",
+        "each condition right after each other: NOT BALANCED: mostly once; twice: B right after A",
     ]
 
 

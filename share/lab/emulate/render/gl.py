@@ -9,6 +9,7 @@ rest.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -118,6 +119,8 @@ void main() { face = first + float(gl_PrimitiveID); }
 
 
 _UNIT_LIGHT = 100.0  # in the light map
+# images kept: those of a stereo camera that stands, with its samples of a pixel
+_RECENT = 8
 # direction and strength of the fixed shading of movers, world frame
 _MOVER_LAMP = np.array([0.12, 0.08, 0.22])
 # floats of each vertex attribute
@@ -142,6 +145,7 @@ class GlRoom:
         }
         self._textures = _textures(gl, room)
         self._targets: dict[tuple[int, int], Any] = {}
+        self._recent = OrderedDict[tuple[Any, ...], F32]()  # images by all that OpenGL is given for them
         gl.enable(gl.DEPTH_TEST)
 
     @property
@@ -150,16 +154,27 @@ class GlRoom:
         return f"{self._gl.info['GL_RENDERER']}, {self._gl.info['GL_VERSION']}"
 
     def image(self, camera: Camera, instant: SceneInstant) -> F32:
-        """Return (H, W) gray levels, one sample a pixel: aliased on its own, see above."""
-        lamp = _MOVER_LAMP @ instant.T_world_cam[:3, :3]
+        """Return (H, W) gray levels, one sample a pixel: aliased on its own, see above. Read-only."""
+        views = list(self._visible_pieces(camera, instant))
+        to_lamp = _MOVER_LAMP @ instant.T_world_cam[:3, :3]
+        lamps = [None if piece is self._room else (T[:3, :3] @ to_lamp).astype("f4") for piece, T, _ in views]
+        key = camera, *(_drawn_bytes(*view, lamp) for view, lamp in zip(views, lamps, strict=True))
+        if key in self._recent:
+            self._recent.move_to_end(key)
+            return self._recent[key]
         with self._gl:
             target = self._cleared_target(camera)
-            for piece, T, chunks in self._visible_pieces(camera, instant):
-                program = self._room_program if piece is self._room else self._mover_program
-                if program is self._mover_program:
-                    program["lamp"] = tuple(T[:3, :3] @ lamp)
+            for (piece, T, chunks), lamp in zip(views, lamps, strict=True):
+                program = self._room_program if lamp is None else self._mover_program
+                if lamp is not None:
+                    program["lamp"] = tuple(lamp.tolist())
                 self._draw(piece, program, camera, T, chunks)
-            return _read_target(target, camera)
+            image = _read_target(target, camera)
+        image.flags.writeable = False
+        self._recent[key] = image
+        if len(self._recent) > _RECENT:
+            self._recent.popitem(last=False)
+        return image
 
     def depth(self, camera: Camera, instant: SceneInstant) -> F32:
         """Return (H, W) m along the optical axis, 0 where there is nothing."""
@@ -282,6 +297,12 @@ def _textures(gl: Any, room: DrawableRoom) -> tuple[Any, Any]:
     pictures.use(0)
     light.use(1)
     return pictures, light
+
+
+def _drawn_bytes(piece: _GlPiece, T_piece_cam: F64, chunks: I64, lamp: F32 | None) -> tuple[Any, ...]:
+    """Return what OpenGL is given to draw a piece: the same bytes draw the same pixels."""
+    place = T_piece_cam[:3].astype("f4").tobytes()
+    return id(piece), place, chunks.tobytes(), None if lamp is None else lamp.tobytes()
 
 
 def _read_target(target: Any, camera: Camera) -> F32:
