@@ -56,7 +56,7 @@ class Blinding:
 
 
 class NoBlinding:
-    """Covers nothing: of an edge that is in no study."""
+    """Covers nothing: for an edge outside a blind study."""
 
     def covered(self, report: dict[str, Any]) -> dict[str, Any]:
         return report

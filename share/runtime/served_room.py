@@ -12,7 +12,7 @@ from __future__ import annotations
 import queue
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -159,7 +159,7 @@ class ServedRoom:
         """Return the newest pose of each present run, by run key."""
         return self._state_machine.latest_poses()
 
-    def series(self) -> dict[str, Any]:
+    def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of edge.json."""
         return self._blinding.covered_series(self._state_machine.series())
 
