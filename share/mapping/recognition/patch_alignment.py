@@ -9,7 +9,7 @@ with the whole one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ import numpy as np
 from share.geometry import se3
 from share.geometry.camera import Camera, project, rays
 from share.mapping.recognition.depth_scale import DepthScale
+from share.mapping.recognition.relative_tilt import RelativeTilt
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import F32, F64, I64, U8, KeyframeImage, View
 from share.vision import patches
@@ -58,11 +59,14 @@ _SHARED_ERROR = 2.0  # factor on sigma in the graph: the loops of a keyframe sha
 
 @dataclass(frozen=True, eq=False)
 class ImageView:
-    """The image of a keyframe with its camera, decoded when needed. T_body_cam0 (4, 4)."""
+    """The image of a keyframe with its camera, decoded when needed. T_body_cam0 (4, 4); up, up_sigma: as in
+    `CameraView`."""
 
     source: KeyframeImage
     camera: Camera
     T_body_cam0: F64
+    up: F64 = field(default_factory=lambda: np.zeros(3))
+    up_sigma: float = 0.0
 
     @cached_property
     def pixels(self) -> U8 | None:
@@ -305,11 +309,12 @@ def _shared_sigma(query: ImageView, candidate: ImageView) -> float:
 def _fit_pose(
     T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
 ) -> _AlignedPose:
-    """Fit the pose, and the scale of either view's depths, to all aligned positions. size: px of the image
-    per px of the level. Raises LinAlgError where they do not determine it."""
+    """Fit the pose, and the scale of either view's depths, to all aligned positions and what is known of the
+    tilts. size: px of the image per px of the level. Raises LinAlgError where they do not determine it."""
     scale_sigma = np.array([query.shared_depth_sigma, candidate.shared_depth_sigma])
     prior = np.diag(np.concatenate([np.full(6, _RIDGE), scale_sigma**-2]))
     log_scales = np.zeros(2)  # of the query's depths and the candidate's
+    tilt = RelativeTilt.between(query, candidate)
     for _ in range(_ITERATIONS):
         at_candidate = _residuals(T, query, candidate, forward, size, log_scales[0])
         at_query = _residuals(se3.inverse(T), candidate, query, backward, size, log_scales[1])
@@ -323,6 +328,9 @@ def _fit_pose(
         information = A.T @ A + prior
         gradient = A.T @ (r * root_weight[:, None]).ravel()
         gradient[6:] -= log_scales / scale_sigma**2
+        known = tilt.equations(T)
+        information[:6, :6] += known[0]
+        gradient[:6] += known[1]
         step = np.linalg.solve(information, gradient)
         T, log_scales = se3.exp(step[:6]) @ T, log_scales + step[6:]
         if np.abs(step).max() < _CONVERGED_STEP * size:
