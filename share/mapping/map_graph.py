@@ -314,12 +314,6 @@ class MapGraph:
                 return edge_id, edge
         raise ValueError(f"no odometry edge from node {previous} to {node_id}")
 
-    def loop_partners(self, node_ids: Sequence[int]) -> list[int]:
-        """Return the nodes with which these have loops."""
-        edges = self.edges
-        ends = (edges.by_id[n] for node in node_ids for n in edges.incident(node) if n in edges.loops)
-        return sorted({end for edge in ends for end in (edge.a, edge.b)}.difference(node_ids))
-
     def segment(self, key: KeyframeKey) -> int:
         return self.odometry.nodes[self.odometry.node_id(key)].segment
 

@@ -168,7 +168,7 @@ class MapSolving:
             nodes = graph.odometry.segments[segment].nodes
             shown = [
                 n
-                for n in graph.loop_partners(nodes[-_PLACE_KEYFRAMES:])
+                for n in self._loop_partners(nodes[-_PLACE_KEYFRAMES:])
                 if (other := graph.odometry.nodes[n].segment) == reference_segment
                 or gate.is_published(other, reference_segment)
             ]
@@ -176,6 +176,12 @@ class MapSolving:
                 covs = graph.relative_estimates(nodes[-1], shown).cov
                 out.append((shown[int(np.argmin([sigma_ahead(cov) for cov in covs]))], nodes[-1]))
         return tuple(out)
+
+    def _loop_partners(self, node_ids: Sequence[int]) -> list[int]:
+        """Nodes with which these have loops."""
+        edges = self._graph.edges
+        loops = (edges.by_id[n] for node in node_ids for n in edges.incident(node) if n in edges.loops)
+        return sorted({end for edge in loops for end in (edge.a, edge.b)}.difference(node_ids))
 
     def apply(self, job: SolveJob, solution: GraphSolution) -> AppliedSolution:
         """Apply a solution; keyframes and loops that arrived meanwhile are kept.

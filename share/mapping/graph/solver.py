@@ -6,7 +6,7 @@ Runs in one thread, without a clock. Cost: docs/understand/mapping.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np

@@ -101,6 +101,15 @@ def refine_relative_pose(
     residual variance, at least a quarter.
     """
     problem = _RefinementProblem(y_q, y_c, noise_q, noise_c)
+    refined = _refine(T_c_q, problem, gate, tilt, iterations)
+    if tilt.contradicts(refined.T):
+        refined = _refine(T_c_q, problem, gate, UNKNOWN_TILT, iterations)
+    return refined
+
+
+def _refine(
+    T_c_q: F64, problem: _RefinementProblem, gate: float, tilt: RelativeTilt, iterations: int
+) -> RefinedPose:
     T, information = T_c_q, problem.information(T_c_q)
     for _ in range(iterations):
         linear = problem.linearise(T, information)
@@ -118,7 +127,7 @@ def refine_relative_pose(
     variance = max(0.25, float(linear.d2[is_inlier].sum()) / dof)
     adjoint = se3.adjoint(se3.inverse(T))
     cov = np.linalg.inv((linear.normal(is_inlier)[:6, :6] + _RIDGE) / variance + known[0])
-    d2 = np.empty(len(y_q))
+    d2 = np.empty(len(linear.d2))
     d2[problem.order] = linear.d2
     return RefinedPose(se3.orthonormal(T), adjoint @ cov @ adjoint.T, d2)
 
@@ -143,7 +152,7 @@ class _LinearSystem:
         return np.asarray(self.Jr.reshape(7, -1) @ (self.WJr * weight).reshape(7, -1).T)
 
     def step(self, weight: NDArray[Any], known: tuple[F64, F64]) -> F64:
-        """Gauss-Newton step (6,) of matches weighted by (N,). known: equations (6, 6), (6,) of what else is."""
+        """Gauss-Newton step (6,) of matches weighted by (N,). known: equations of what else is known."""
         normal, (H, g) = self.normal(weight), known
         return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE + H, normal[:6, 6] + g), np.float64)
 

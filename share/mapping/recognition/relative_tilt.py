@@ -2,7 +2,8 @@
 
 A person and a robot see the same surfaces from other heights, few of them, and mostly from afar: a tilt then
 looks nearly like a height. Both tilts are known from gravity to a tenth of a degree, so the images have to
-tell four of the six degrees of freedom only.
+tell four of the six degrees of freedom only. Where images contradict, a camera may sit on its IMU otherwise
+than is said: then they decide alone, so that the loop tells of it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from share.geometry import se3
 from share.types import F64
 
+_CONTRADICT_CHI2 = 9.0  # of the angle between both directions
 _FLOOR_RAD = float(np.radians(0.1))  # of either: no camera is calibrated to its IMU better
 
 
@@ -53,6 +55,11 @@ class RelativeTilt:
         )
         variance = query.up_sigma**2 + candidate.up_sigma**2 + 2 * _FLOOR_RAD**2
         return RelativeTilt(up_q, up_c, float(np.sqrt(variance)))
+
+    def contradicts(self, T_c_q: F64) -> bool:
+        """Return whether a pose that was fitted to images and tilts is still three sigma from these."""
+        difference = (self.up_c - T_c_q[:3, :3] @ self.up_q) / self.sigma
+        return bool(difference @ difference > _CONTRADICT_CHI2)
 
     def equations(self, T_c_q: F64) -> tuple[F64, F64]:
         """Information (6, 6) and gradient (6,) of Exp(xi) T_c_q at xi = 0: xi solves H xi = g."""
