@@ -314,12 +314,13 @@ def test_an_edge_needs_two_poses() -> None:
 
 def test_relative_covariances_are_those_with_the_first_pose_as_the_anchor() -> None:
     room = simulate(120, 3, 6)
-    pairs = [(100, 119), (119, 40)]
+    pairs = [(118, 119), (119, 40)]
     solution = loaded(room).solve(0, [119], pairs)
     assert solution.pair_covariances.shape == (2, 6, 6)
     for (a, b), cov in zip(pairs, solution.pair_covariances, strict=True):
         elsewhere = loaded(room)
         elsewhere.solve(0)  # so that it starts from the same poses
-        np.testing.assert_allclose(cov, elsewhere.solve(a, [b]).covariances[0], rtol=0.02)
+        expected = elsewhere.solve(a, [b]).covariances[0]
+        np.testing.assert_allclose(cov, expected, rtol=0.02, atol=0.01 * expected.max())
     assert np.trace(solution.pair_covariances[0]) < np.trace(solution.covariances[0])
     assert loaded(room).solve(0).pair_covariances.shape == (0, 6, 6)
