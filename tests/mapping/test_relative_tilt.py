@@ -129,3 +129,20 @@ def test_the_views_of_a_keyframe_know_its_up_direction_and_its_sigma(is_image: b
     seen = views.image(0) if is_image else views.by_node[0]
     assert seen is not None
     assert (seen.up == keyframe.up).all() and seen.up_sigma == keyframe.up_sigma == UP_SIGMA
+
+
+def test_images_that_contradict_the_tilts_decide_alone() -> None:
+    """A camera that sits on its IMU by three degrees otherwise than is said: the loop has to tell."""
+    room, T_world_c = (
+        Planes([[0.1, 0.05, 0.4], [-0.6, 0.0, 0.3], [0.0, 0.7, 0.25]], 3),
+        se3.inverse(T_BODY_CAM),
+    )
+    T_world_q = se3.exp(np.array([0.05, 0.12, 0.03, 0.15, -0.05, 0.1])) @ T_world_c
+    true, rng = se3.inverse(T_world_c) @ T_world_q, np.random.default_rng(1)
+    query, candidate = (textured_planes.image_view(room, T, rng) for T in (T_world_q, T_world_c))
+    turned = se3.so3_exp(np.radians(3.0) * np.cross(UP, [1.0, 0.0, 0.0])) @ T_world_q[:3, :3]
+    wrong = dataclasses.replace(query, up=turned.T @ UP)
+    alone = align_images(true, query, candidate)
+    found = align_images(true, wrong, upright(candidate, T_world_c))
+    assert alone is not None and found is not None
+    np.testing.assert_array_equal(found.T_c_q, alone.T_c_q)
