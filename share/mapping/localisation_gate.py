@@ -19,7 +19,7 @@ from share.types import F64
 
 PATIENCE = 20  # keyframes with loops after which agents enter another map however uncertain
 _WIDENS_AFTER = 8  # keyframes with loops; with n times as many, n times the sigma is enough
-ROBOT_SHARE = 0.4  # of the sigma that is enough for a wearer: a robot's odometry is surer, and can wait
+ROBOT_SHARE = 0.8  # of the sigma that is enough for a wearer: a robot's odometry is surer
 AHEAD_M = 3.0  # what a wearer or robot looks at; a rotation moves it by this lever
 
 
@@ -32,8 +32,9 @@ def sigma_ahead(cov: F64) -> float:
 class PlacementUncertainty:
     """Uncertainty of an agent's pose in a map.
 
-    cov (6, 6): of T_map_odom. sigma_m: `sigma_ahead` of the body's pose. answered_id: the agent's keyframe
-    with a loop that is new in this solution, or None. is_worn: by somebody who waits to share the map.
+    cov (6, 6): of T_map_odom. sigma_m: `sigma_ahead` of the body's pose, relative to what is shown around it
+    where that is known. answered_id: the agent's keyframe with a loop that is new in this solution, or None.
+    is_worn: by somebody who waits to share the map.
     """
 
     cov: F64
