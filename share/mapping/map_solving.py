@@ -16,6 +16,7 @@ from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_gauge import MapGauge, SolvedPlace
 from share.mapping.map_graph import MapGraph
 from share.mapping.segments import AgentRuns
+from share.mapping.settling import Settling
 from share.types import F64, Correction
 
 _OUTLIER_CHI2 = 1000.0  # loops with a larger chi-squared after a solution are dropped
@@ -80,12 +81,19 @@ class MapSolving:
     ) -> None:
         self._graph, self._loop_acceptance = graph, loop_acceptance
         self._localisation_gate, self._runs = localisation_gate, runs
-        self._gauge = MapGauge()
+        self._gauge, self._settling = MapGauge(), Settling()
         self._answered_ids: dict[str, int] = {}  # newest keyframe of each agent with a loop not solved yet
 
     def mark_answered(self, key: KeyframeKey) -> None:
         """A loop from this keyframe was accepted; the next solution of its map answers it."""
         self._answered_ids[key.agent] = max(key.id, self._answered_ids.get(key.agent, -1))
+
+    def add_keyframe(self, node_id: int) -> None:
+        """Solve the map of an agent that settles in it once more."""
+        segment = self._graph.odometry.nodes[node_id].segment
+        reference_segment = self._graph.reference_segments[segment]
+        if self._settling.is_settling(segment, reference_segment):
+            self._graph.unsolved_maps.setdefault(reference_segment)
 
     def remove_run(self, agent: str) -> None:
         self._answered_ids.pop(agent, None)
@@ -93,6 +101,7 @@ class MapSolving:
     def forget_all_but(self, segments: Collection[int]) -> None:
         """Forget what was shown to all but these segments: the others have no keyframes."""
         self._gauge.forget_all_but(segments)
+        self._settling.forget_all_but(segments)
 
     def schedule_unpublished(self, agent: str) -> None:
         """Solve the map of a run that reconnected, unless its pose there was published."""
@@ -242,11 +251,17 @@ class MapSolving:
         }
         self._localisation_gate.forget_waits(self._graph.split_segments)
         self._graph.split_segments.clear()
-        waiting = self._localisation_gate.update(job.segments[0], job.segments, uncertainties)
+        gate, reference_segment = self._localisation_gate, job.segments[0]
+        outside = [s for s in uncertainties if not gate.is_published(s, reference_segment)]
+        waiting = gate.update(reference_segment, job.segments, uncertainties)
+        newest_nodes = dict(zip(job.segments, job.newest_nodes, strict=True))
+        for s in outside:
+            if s != reference_segment and gate.is_published(s, reference_segment):
+                self._settling.begin(s, reference_segment, nodes[newest_nodes[s]].ordinal)
         return {odometry.segments[s].agent: sigma_m for s, sigma_m in waiting.items()}
 
     def _corrections(self, job: SolveJob) -> tuple[dict[str, Correction], dict[str, str]]:
-        """Corrections of the agents that passed the gate, and why those of others are invalid.
+        """Corrections of the agents that passed the gate and settled, and why those of others are invalid.
 
         Keyframes newer than the solution follow the newest solved one rigidly.
         """
@@ -255,7 +270,9 @@ class MapSolving:
         for segment, last in zip(job.segments, job.newest_nodes, strict=True):
             cov = self._localisation_gate.published_cov(segment, job.segments[0])
             is_current = odometry.current_segment(odometry.segments[segment].agent) == segment
-            if cov is not None and is_current and last in odometry.nodes:
+            if cov is None or not is_current or last not in odometry.nodes:
+                continue
+            if not self._settling.continues(segment, job.segments[0], odometry.nodes[last].ordinal):
                 passed[segment] = last, cov
         shown = self._gauge.show(job.segments[0], self._solved_places(passed))
         out: dict[str, Correction] = {}

@@ -15,6 +15,8 @@ from share.mapping.atlas import Atlas
 from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
 from share.mapping.loops import KeyframeKey, Loop
 
+pytestmark = pytest.mark.usefixtures("entered_at_once")
+
 ANN, BOB, EVE, ROBOT = ALL = range(4)  # segments, the oldest first
 
 
