@@ -19,7 +19,7 @@ from share.types import F64
 
 PATIENCE = 20  # keyframes with loops after which agents enter another map however uncertain
 _WIDENS_AFTER = 8  # keyframes with loops; with n times as many, n times the sigma is enough
-ROBOT_SHARE = 0.8  # of the sigma that is enough for a wearer: a robot's odometry is surer
+ROBOT_SHARE = 0.4  # of the sigma that is enough for a wearer: a robot's odometry is surer, and can wait
 AHEAD_M = 3.0  # what a wearer or robot looks at; a rotation moves it by this lever
 
 
