@@ -74,10 +74,10 @@ def test_the_gate_opens_wider_with_the_keyframes_that_did_not_help() -> None:
 
 
 def test_a_robot_waits_until_it_is_surer_unless_it_comes_with_a_wearer(gate: LocalisationGate) -> None:
-    robot = dataclasses.replace(known(4.1), is_worn=False)
+    robot = dataclasses.replace(known(2.1), is_worn=False)
     gate.update(ROBOT, ALL, {ROBOT: known(0.0)})
     assert gate.update(ANN, ALL, {ROBOT: robot}).keys() == {ROBOT}
-    assert not gate.update(ANN, ALL, {ROBOT: dataclasses.replace(robot, sigma_m=0.039)})
+    assert not gate.update(ANN, ALL, {ROBOT: dataclasses.replace(robot, sigma_m=0.019)})
     gate.update(BOB, ALL, {BOB: known(0.0), EVE: dataclasses.replace(robot, sigma_m=0.0)})
     assert not gate.update(ANN, ALL, {BOB: known(4.5), EVE: robot})
 
