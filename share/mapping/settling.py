@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 SETTLING_KEYFRAMES = 2  # of the agent, after the gate has opened
-MAX_SOLUTIONS = 10  # of the map: an agent that stands still makes no keyframes
+MAX_SOLUTIONS = 100  # of the map, thirty a second at most: an agent that stands still makes no keyframes
 
 
 class Settling:

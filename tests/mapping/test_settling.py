@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from helpers.atlas_sim import Walker, loop, settle
 
 from share.config import MergeConfig
+from share.mapping import settling as module
 from share.mapping.atlas import Atlas
-from share.mapping.settling import MAX_SOLUTIONS, SETTLING_KEYFRAMES, Settling
+from share.mapping.settling import SETTLING_KEYFRAMES, Settling
 
 ANN, BOB = range(2)
 
@@ -48,15 +50,16 @@ def test_the_map_is_solved_anew_for_each_of_them() -> None:
     assert atlas.solving.due_maps() == []
 
 
-def test_who_stands_still_enters_after_some_solutions() -> None:
+def test_who_stands_still_enters_after_some_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_SOLUTIONS", 10)
     atlas, walkers, rng = met()
     corrected = [one.corrections for one in settle(atlas)]
-    for k in range(10, 10 + 2 * MAX_SOLUTIONS):
+    for k in range(10, 30):
         atlas.add_keyframe("ann", walkers["ann"].keyframes[k])
         atlas.propose(loop(walkers["ann"], k, walkers["bob"], 9, rng))
         corrected += [one.corrections for one in settle(atlas)]
     waited = next(i for i, corrections in enumerate(corrected) if "bob" in corrections)
-    assert waited == MAX_SOLUTIONS
+    assert waited == 10
 
 
 def test_an_undone_merge_holds_no_correction_back_in_the_own_map() -> None:
