@@ -27,13 +27,18 @@ def walked_round(path: Sequence[Point]) -> list[Point]:
 
 def walk_line(plan: StudyPlan) -> str:
     """Return the researcher's path in words."""
-    way = walked_round(plan.path)
-    length_m = sum(math.dist(a, b) for a, b in pairwise(way))
-    places = " → ".join(f"{x:g} {y:g}" for x, y in way)
+    places = " → ".join(f"{x:g} {y:g}" for x, y in walked_round(plan.path))
+    length_m, seconds = _round(plan)
     return (
         f"the researcher walks {places} m, round and round at {plan.walk_m_s:g} m/s: {length_m:.1f} m, "
-        f"{length_m / plan.walk_m_s:.0f} s a round"
+        f"{seconds:.0f} s a round"
     )
+
+
+def _round(plan: StudyPlan) -> tuple[float, float]:
+    """Return the length of a round, m, and how long it takes, s."""
+    length_m = sum(math.dist(a, b) for a, b in pairwise(walked_round(plan.path)))
+    return length_m, length_m / plan.walk_m_s
 
 
 def draw_floor(path: Path, plan: StudyPlan) -> None:
@@ -57,10 +62,10 @@ def draw_floor(path: Path, plan: StudyPlan) -> None:
     axis.set_aspect("equal")
     axis.grid(alpha=0.3)
     axis.set(xlabel="x, m", ylabel="y, m")
-    length_m = sum(math.dist(a, b) for a, b in pairwise(way))
+    length_m, seconds = _round(plan)
     axis.set_title(
         f"{len(plan.spots)} spots; the researcher's path (blue): {plan.walk_m_s:g} m/s,\n"
-        f"{length_m:.1f} m and {length_m / plan.walk_m_s:.0f} s a round",
+        f"{length_m:.1f} m and {seconds:.0f} s a round",
         fontsize=9,
     )
     save_png(figure, path, 130)

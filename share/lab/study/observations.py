@@ -16,14 +16,14 @@ import numpy as np
 
 from share.config import POLICY_NAMES
 from share.errors import DataError
-from share.files.json_file import own_format_errors, read_json_lines
+from share.files.json_file import own_format_errors
 from share.files.reading import MB, read_errors, read_text
 from share.lab.study.orders import MAX_CONDITIONS, MIN_CONDITIONS
 from share.lab.study.plan import ANSWERS, MAX_PARTICIPANTS, StudyPlan, SuccessRule
 from share.lab.study.trials import (
-    MAX_LINES_BYTES,
     TRIAL_MEASURES,
     TrialRecord,
+    answer_rows,
     read_trials,
     trial_measures,
 )
@@ -182,13 +182,8 @@ def _read_answers(path: Path, plan: StudyPlan) -> tuple[dict[str, F64], dict[str
     letters = {letter: k for k, letter in enumerate(plan.letters)}
     table = {one.name: np.full((len(people), len(letters)), math.nan) for one in plan.questions}
     choices = {kind: [""] * len(people) for kind in _CHOICES}
-    rows = read_json_lines(path, MAX_LINES_BYTES) if path.exists() else []
-    for number, row in enumerate(rows, 1):
-        where = f"{path}, line {number}"
+    for where, person, row in answer_rows(path, plan):
         with own_format_errors(Path(where)):
-            person = row["participant"]
-            if person not in people:
-                raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
             if "answers" in row:
                 _put_answers(
                     table,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from share.errors import DataError, UsageError
-from share.files.json_file import own_format_errors, read_json_lines
+from share.files.json_file import own_format_errors
 from share.lab.study.plan import ANSWERS, Participant, StudyPlan
-from share.lab.study.trials import MAX_LINES_BYTES, read_trials
+from share.lab.study.trials import answer_rows, read_trials
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,8 @@ def read_progress(folder: Path, plan: StudyPlan) -> StudyProgress:
 def _read_answered(path: Path, plan: StudyPlan) -> tuple[set[tuple[str, str]], set[str]]:
     """Return who has answered after which condition, and who has chosen. Raises DataError."""
     answered, chosen = set[tuple[str, str]](), set[str]()
-    people = {one.name for one in plan.participants}
-    for number, row in enumerate(read_json_lines(path, MAX_LINES_BYTES) if path.exists() else [], 1):
-        where = f"{path}, line {number}"
+    for where, person, row in answer_rows(path, plan):
         with own_format_errors(Path(where)):
-            person = row["participant"]
-            if person not in people:
-                raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
             if "answers" in row:
                 if row["condition"] not in plan.letters:
                     raise DataError(f"{where}: condition {row['condition']!s:.40} is not in the plan")

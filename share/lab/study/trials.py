@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -112,6 +112,20 @@ def read_trials(study: Path, plan: StudyPlan) -> dict[tuple[str, int], TrialReco
         if path.exists():
             records[participant, place] = read_trial(path, plan, participant, place, condition)
     return records
+
+
+def answer_rows(path: Path, plan: StudyPlan) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Yield, of each line of the answers, where it is, its participant and its content; nothing without a
+    file. Raises DataError for a participant who is not in the plan."""
+    people = {one.name for one in plan.participants}
+    rows = read_json_lines(path, MAX_LINES_BYTES) if path.exists() else []
+    for number, row in enumerate(rows, 1):
+        where = f"{path}, line {number}"
+        with own_format_errors(Path(where)):
+            person = row["participant"]
+            if person not in people:
+                raise DataError(f"{where}: participant {person!s:.40} is not in the plan")
+        yield where, person, row
 
 
 def read_trial(path: Path, plan: StudyPlan, participant: str, place: int, condition: str) -> TrialRecord:
