@@ -83,7 +83,7 @@ class RealSenseRecording(Recording):
 
     def measurements(self) -> Iterator[Measurement]:
         for m in self._repair(images=True):
-            if self.is_in_span(m.stream, m.stamp_ns):
+            if self.is_in_time_range(m.stream, m.stamp_ns):
                 yield m if m.stream == IMU else Measurement(m.stream, m.stamp_ns, self._image(m))
 
     @cached_property

@@ -86,12 +86,12 @@ class TimeRange(NamedTuple):
         return (self.imu_from, self.imu_to) if stream == IMU else (self.image_from, self.image_to)
 
 
-UNBOUNDED_NS = 2**62  # limit of a span without an end
+UNBOUNDED_NS = 2**62  # limit of a time range without an end
 WHOLE = TimeRange(-UNBOUNDED_NS, UNBOUNDED_NS, -UNBOUNDED_NS, UNBOUNDED_NS)
 
 
 def select_time_range(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> TimeRange:
-    """Return the span of cam0's images number `frames`, with the IMU samples since the image before them.
+    """Return the time range of cam0's images number `frames`, with the IMU samples since the image before.
 
     cam0 (N,): stamps of its images, ns. imu_shift_ns: IMU time minus camera time. Raises DataError without
     images, UsageError if nothing is left or the slice has a step.
@@ -115,7 +115,7 @@ def select_time_range(cam0: I64, frames: slice | None, where: str, imu_shift_ns:
 
 
 class Recording(Source):
-    """A recording on disk, of which `span` is read."""
+    """A recording on disk, of which `time_range` is read."""
 
     time_range: TimeRange = WHOLE
 
@@ -130,7 +130,7 @@ class Recording(Source):
             out[stream] = stamps[(stamps > lo) & (stamps <= hi)]
         return out
 
-    def is_in_span(self, stream: str, stamp_ns: int) -> bool:
+    def is_in_time_range(self, stream: str, stamp_ns: int) -> bool:
         lo, hi = self.time_range.limits(stream)
         return lo < stamp_ns <= hi
 
@@ -171,7 +171,7 @@ class FolderSource(Recording):
         return heapq.merge(*streams, key=lambda m: m.stamp_ns)
 
     def _stream(self, name: str, items: Any) -> Iterator[Measurement]:
-        return (Measurement(name, stamp, one) for stamp, one in items if self.is_in_span(name, stamp))
+        return (Measurement(name, stamp, one) for stamp, one in items if self.is_in_time_range(name, stamp))
 
     def truth(self) -> Trajectory | None:
         return self._read_truth()

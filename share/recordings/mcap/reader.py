@@ -87,7 +87,7 @@ class McapSource(Recording):
             try:
                 message = ros.decode(data, self.file.topics[topic].kind, f"{self.file.path}: {topic}")
                 stamp = ros.stamp_of(message)
-                if not self.is_in_span(streams[topic], stamp):
+                if not self.is_in_time_range(streams[topic], stamp):
                     continue
                 payload = self._payload(message, topic, stamp, streams[topic])
             except DataError as error:  # skip this message only
