@@ -13,11 +13,14 @@ import pytest
 from helpers.children import SHARE, Child, start_agent
 
 from share.config import Config
+from share.lab.emulate.recipe import SessionRecipe
+from share.lab.emulate.session import make_session
+from share.lab.emulate.small_pictures import profile_of_mode
 from share.recordings.trajectory import format_tum
 from share.runtime.offline_tracking import track
 from share.runtime.source import open_source
 
-FRAMES = 45
+FRAMES, LONGER = 45, 120
 ROOMY = "stream: {window: 60}\n"  # nothing is dropped, however busy this machine is
 
 
@@ -83,15 +86,20 @@ def trackers_of(edge: Child) -> list[int]:
     return [pid for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
+def longer_recording(folder: Path) -> Path:
+    """One on which the killed tracker is back long before the end: 1 s after its death, and its start."""
+    profile = profile_of_mode("320x240@15")
+    recipe = SessionRecipe("plain", ("ar1=walk:",), LONGER / 15, 18, profiles={"": profile})
+    return make_session(recipe, folder / "session", workers=1) / "ar1"
+
+
 @pytest.mark.long
-def test_a_tracker_that_is_killed_costs_its_agent_only(
-    plain_session: Path, tmp_path: Path, config: Path
-) -> None:
+def test_a_tracker_that_is_killed_costs_its_agent_only(tmp_path: Path, config: Path) -> None:
+    recording = longer_recording(tmp_path)
     settings = ("--config", str(config))
     edge, address = edge_that_tracks(tmp_path, *settings)
     agents = [
-        start_agent(tmp_path, name, plain_session / "ar1", address, "--streamed", *settings)
-        for name in ("ann", "bob")
+        start_agent(tmp_path, name, recording, address, "--streamed", *settings) for name in ("ann", "bob")
     ]
     await_poses(*(tmp_path / name / "odom.tum.partial" for name in ("ann", "bob")))
     first = trackers_of(edge)
@@ -103,13 +111,13 @@ def test_a_tracker_that_is_killed_costs_its_agent_only(
     assert edge.interrupt() == 0
     assert not any(Path(f"/proc/{pid}").exists() for pid in first)
     hit, other = (lost[1], {"ann": "bob", "bob": "ann"}[lost[1]])
-    assert (tmp_path / other / "odom.tum").read_text() == tracked_here(plain_session / "ar1")
+    assert (tmp_path / other / "odom.tum").read_text() == tracked_here(recording)
     assert report_of(tmp_path, other)["untracked"] == 0
     assert report_of(tmp_path, other)["segments"] == 1
     of_hit = report_of(tmp_path, hit)
-    assert of_hit["frames"] + of_hit["untracked"] == FRAMES
+    assert of_hit["frames"] + of_hit["untracked"] == LONGER
     assert of_hit["segments"] == 2
-    assert of_hit["tracked"] > FRAMES / 3
+    assert of_hit["tracked"] > LONGER / 3
     reported = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]
     assert reported[hit]["frames_dropped"] <= of_hit["untracked"]  # which counts answers that came late, too
     assert reported[other]["frames_dropped"] == 0
