@@ -20,6 +20,7 @@ from share.scheduling.qoe import QoeTable
 from share.types import F64
 
 STEP_HZ = 0.25  # in which rates are allocated, and rise again
+JOINING_LOAD = 0.5  # for agents that share a map with nobody: keyframes take at most twice as long as alone
 MAX_LOAD = 0.95  # beyond, the formula has no meaning
 _HELD = 1.5  # how much more a step must gain another agent than one that has it already
 _LOAD_STEP = 0.01
@@ -32,7 +33,7 @@ class AirDemand:
     """What N agents want of the air that they share, arrays (N,). air_s: T, of a keyframe alone; usual_air_s:
     for the room as a whole. message_load: of all small messages. weight: of an agent's QoE. other_delay_ms:
     the part of its delay that is not the air's. error_cm: NaN if unknown; drift_cm: the part of it that
-    grows between keyframes, at measured_hz. held_hz: what it has."""
+    grows between keyframes, at measured_hz. held_hz: what it has. is_placed: see `AgentDemand`."""
 
     terms: QoeTable
     airtime_s: F64
@@ -46,6 +47,7 @@ class AirDemand:
     error_cm: F64
     drift_cm: F64
     measured_hz: F64
+    is_placed: NDArray[np.bool_]
 
     def load(self, hz: F64) -> float:
         """Return the load at these rates, at most MAX_LOAD."""
@@ -63,10 +65,12 @@ def allocate_rates(demand: AirDemand, waits_ms: Sequence[float]) -> list[F64]:
     """Return the rates (N,), Hz, for each of `waits_ms`, which rise: the least rates, then a step at a time
     to the agent that gains most by it. While keyframes wait for others for less, agents of the AR form come
     before others; beyond, a step must gain more than the delay that it causes costs all, and only they get
-    one, unless there is none of them."""
+    one, unless there is none of them. Agents that share a map with nobody get what is left up to
+    `JOINING_LOAD`: each of their keyframes may be the one that is recognised."""
     if not len(demand.wanted_hz):
         return [np.zeros(0) for _ in waits_ms]
     is_ar = demand.terms.is_ar
+    joining = np.flatnonzero(~demand.is_placed)
     groups = [np.flatnonzero(of_form) for of_form in (is_ar, ~is_ar) if of_form.any()]
     shared, allocated = _Allocation.least(_GainTable(demand)), list[F64]()
     for wait_ms in waits_ms:
@@ -78,6 +82,8 @@ def allocate_rates(demand: AirDemand, waits_ms: Sequence[float]) -> list[F64]:
         for group in groups:
             own.fill(group, limit)
         own.fill_while_worth_it(groups[0])
+        if len(joining):
+            own.fill(joining, JOINING_LOAD)
         allocated.append(own.hz)
     return allocated
 

@@ -248,6 +248,7 @@ class RoomBudget:
             error_cm=error_cm,
             drift_cm=np.minimum([agent.drift_cm for agent in agents], error_cm),
             measured_hz=np.maximum([agent.hz for agent in agents], 1e-3),
+            is_placed=np.array([agent.is_placed for agent in agents]),
         )
 
 

@@ -8,7 +8,7 @@ from share.scheduling.qoe import qoe
 from share.scheduling.room_budget import OTHER_HZ, SCARCE_POSE_HZ, AgentDemand, RoomBudget, message_s
 from share.types import AgentKind
 
-STEP_HZ, LOAD_STEP, MAX_LOAD, HELD = 0.25, 0.01, 0.95, 1.5
+STEP_HZ, LOAD_STEP, MAX_LOAD, HELD, JOINING_LOAD = 0.25, 0.01, 0.95, 1.5, 0.5
 WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}
 
 
@@ -34,12 +34,18 @@ class StepwiseAllocation:
                 cost = STEP_HZ * self._cost(hz, load)
                 steps = [n for n in is_open if self._is_first(n) and gain[n] > cost]
             if not steps:
+                steps = [n for n in is_open if self._is_joining(n, load)]
+            if not steps:
                 break
             hz[max(steps, key=lambda n: gain[n])] += STEP_HZ
         return hz
 
     def _is_first(self, name: str) -> bool:
         return self._agents[name].terms.form is self._first_form
+
+    def _is_joining(self, name: str, load: float) -> bool:
+        """Whether an agent that shares a map with nobody gets one more step."""
+        return not self._agents[name].is_placed and load + STEP_HZ * self._airtime_s[name] <= JOINING_LOAD
 
     def _load(self, hz: dict[str, float]) -> float:
         messages = sum(

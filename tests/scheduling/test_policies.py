@@ -239,7 +239,7 @@ def test_share_begins_slowly_and_yields_where_keyframes_take_long() -> None:
     quick = Evaluation(0, 45.0, 1.0, track_ms=10.0, rtt_ms=5.0, ack_ms=8.0)
     assert share.evaluate("ann", report(AgentKind.AR, 1.0, slow)) == least
     alone = replace(report(AgentKind.AR, 1.0, slow), is_placed=False)  # it shares a map with nobody yet
-    assert made("share", ControlConfig()).evaluate("ann", alone) == scarce_grant(AgentKind.AR, JOINING_HZ)
+    assert made("share", ControlConfig()).evaluate("ann", alone).hz > JOINING_HZ
     disk = replace(report(AgentKind.AR, 1.0, slow), held_ms=299.0)  # the edge's disk, not the air
     assert made("share", ControlConfig()).evaluate("ann", disk) != least
     for k in range(2, 32):

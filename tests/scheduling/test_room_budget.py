@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from share.config import AgentQoe, ControlConfig
 from share.scheduling.qoe import QoeParameters, QoeTable, qoe
 from share.scheduling.room_budget import (
+    JOINING_HZ,
     LEAST_HZ,
+    OTHER_HZ,
     SCARCE_POSE_HZ,
     AgentDemand,
     RateGrant,
@@ -166,6 +168,18 @@ def test_a_robot_delays_no_headset_unless_it_has_the_ar_form() -> None:
     assert granted["a2"] == granted["a0"]
     among_robots = room(agent(ROBOT), agent(ROBOT)).allocate()[0]
     assert among_robots["a0"].hz > LEAST_HZ[ROBOT]
+
+
+def test_an_agent_that_shares_a_map_with_nobody_has_the_air_that_is_idle() -> None:
+    """Its keyframes are what it is recognised by; at half of the air they take twice as long as alone."""
+    robot = agent(ROBOT, 80.0, wanted_hz=20.0)
+    alone = room(*[agent(AR, 80.0)] * 6, replace(robot, is_placed=False))
+    placed, joins = (budget.allocate()[0] for budget in (room(*[agent(AR, 80.0)] * 6, robot), alone))
+    assert placed["a6"].hz == LEAST_HZ[ROBOT] and 2 * JOINING_HZ < joins["a6"].hz < 20.0
+    assert all(joins[f"a{k}"] == placed[f"a{k}"] for k in range(6))
+    air_s = alone.airtime_s(robot)
+    load = sum(air_s * grant.hz + (grant.pose_hz + OTHER_HZ) * message_s(air_s) for grant in joins.values())
+    assert 0.49 < load <= 0.5
 
 
 def test_agents_that_are_silent_or_have_left_take_no_air() -> None:
