@@ -15,6 +15,7 @@ import click
 
 from share.cli import options
 from share.cli.commands import CommandGroup
+from share.cli.study_judge import judge
 from share.cli.study_run import run
 from share.cli.terminal import print_note
 from share.config import POLICY_NAMES, STREAMED
@@ -196,6 +197,7 @@ def _write_plan(plan_path: Path, key_path: Path, plan: StudyPlan, key_text: str)
 
 
 study.add_command(run)
+study.add_command(judge)
 
 
 @study.command(short_help="Tell the policies behind the letters, once all trials are done.")

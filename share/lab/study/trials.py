@@ -21,7 +21,10 @@ from share.files.reading import MB
 from share.lab.study.plan import TRIALS, StudyPlan, SuccessRule
 from share.robot.settings import CREATE3_SPEED_M_S
 
-EVENTS = "events.jsonl"
+EVENTS, EVENTS_BY_MAP = (
+    "events.jsonl",
+    "events-map.jsonl",
+)  # the second: what the map said of a trial judged anew
 MAX_LINES_BYTES = 20 * MB  # of a trial, or of all answers
 JUDGES = ("mocap", "map", "simulation")
 _MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
@@ -94,14 +97,18 @@ def trial_folder(study: Path, participant: str, place: int) -> Path:
     return study / TRIALS / f"{participant}-{place}"
 
 
-def read_trials(study: Path, plan: StudyPlan) -> dict[tuple[str, int], TrialRecord]:
-    """Return the trials that there are, by participant and place. Raises DataError."""
-    planned = {
-        trial_folder(study, one.name, place).name: (one.name, place, trial.condition)
+def planned_trials(plan: StudyPlan) -> dict[str, tuple[str, int, str]]:
+    """Return participant, place and condition of all trials, by the names of their folders."""
+    return {
+        trial_folder(Path(), one.name, place).name: (one.name, place, trial.condition)
         for one in plan.participants
         for place, trial in enumerate(one.trials, 1)
     }
-    folder = study / TRIALS
+
+
+def read_trials(study: Path, plan: StudyPlan) -> dict[tuple[str, int], TrialRecord]:
+    """Return the trials that there are, by participant and place. Raises DataError."""
+    planned, folder = planned_trials(plan), study / TRIALS
     there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     for name in there:
         if name not in planned and not name.startswith("."):

@@ -1,0 +1,177 @@
+"""`share study judge`: judge a trial by motion capture in place of the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.terminal import aligned_table, print_note
+from share.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from share.lab.mocap.trajectory import MocapTrajectory
+    from share.lab.study.plan import StudyPlan
+    from share.lab.study.trials import TrialRecord
+    from share.robot.planar import PlanarPose
+
+_FAR_M = 0.5  # robot by the map and by the motion capture, at the median: the floor is likely wrong
+
+
+@click.command(short_help="Judge a trial by motion capture in place of the map.")
+@click.argument("folder", metavar="DIR", type=options.PATH)
+@click.argument("trial", metavar="TRIAL")
+@click.option(
+    "--mocap",
+    "mocap_file",
+    metavar="FILE",
+    required=True,
+    type=options.EXISTING_FILE,
+    help="Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+)
+@click.option("--body", metavar="BODY", help="Rigid body of the robot.  [default: robot, or the only one]")
+@click.option(
+    "--floor",
+    required=True,
+    metavar="BODY|X,Y,DEG",
+    help="Where the floor's marker is: a rigid body there, or its place and heading with z up.",
+)
+@click.option("--up", type=click.Choice(["z", "y"]), default="z", help="Up axis of the file.")
+@click.option(
+    "--offset",
+    type=float,
+    metavar="S",
+    help="Its clock minus the trial's, s.  [default: found by the robot's motion]",
+)
+@options.rotations
+def judge(
+    folder: Path,
+    trial: str,
+    mocap_file: Path,
+    body: str | None,
+    floor: str,
+    up: str,
+    offset: float | None,
+    rotations: str,
+) -> None:
+    """Judge TRIAL (such as p01-2) of the study in DIR by a motion capture of the robot.
+
+    Put the body's pivot above the middle of the robot. The clocks need not agree: when the robot drives and
+    stands tells the offset. Cubes count as lying at their planned spots; first motion, standstills, way and
+    distances are the motion capture's. The trial's events.jsonl is replaced, what the map said is kept beside
+    it, in events-map.jsonl; judging again begins from there.
+
+    \b
+    Example:  share study judge study p01-2 --mocap take7.csv --body Robot --floor FloorMarker --up y
+    """
+    import json
+
+    from share.files.json_file import own_format_errors, read_json_lines
+    from share.files.writing import atomic_write, check_replaceable
+    from share.lab.mocap.files import pick_body, read_bodies
+    from share.lab.study.mocap_judge import RobotTrack, judged, match_clocks
+    from share.lab.study.plan import read_plan
+    from share.lab.study.trials import EVENTS_BY_MAP, MAX_LINES_BYTES, read_trial
+
+    plan = read_plan(folder)
+    planned, path = _planned_trial(folder, plan, trial)
+    kept = path.with_name(EVENTS_BY_MAP)
+    source = kept if kept.exists() else path
+    before = read_trial(source, plan, *planned)
+    if not before.is_complete:
+        raise UsageError(f"{trial}: is not carried through; finish it by share study run")
+    if before.judge != "map":
+        raise UsageError(f"{source}: is judged by {before.judge} already, and {EVENTS_BY_MAP} is missing")
+    events = read_json_lines(source, MAX_LINES_BYTES)
+    bodies = read_bodies(mocap_file, rotations)
+    _, mocap = pick_body(str(mocap_file), bodies, body, "robot", "--body")
+    track = RobotTrack.of(mocap, _floor(str(mocap_file), bodies, floor, up), up)
+    try:
+        with own_format_errors(source):
+            clock = None if offset is not None else match_clocks(track, events)
+            lines = judged(events, plan, track, offset if clock is None else clock.offset_s)
+    except DataError as error:
+        raise DataError(f"{mocap_file}: {error}") from None
+    check_replaceable(path)
+    if not kept.exists():
+        atomic_write(kept, path.read_bytes())
+    atomic_write(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+    if clock is not None:
+        click.echo(
+            f"clocks: offset {clock.offset_s:.2f} s; driving and standing agree to {clock.agreement:.2f}, at "
+            f"the next best offset to {clock.next_agreement:.2f}"
+        )
+    _print_goals(before, read_trial(path, plan, *planned), plan, lines)
+    click.echo(f"{path}: judged by motion capture; what the map said: {kept}")
+
+
+def _planned_trial(folder: Path, plan: StudyPlan, trial: str) -> tuple[tuple[str, int, str], Path]:
+    """Return participant, place and condition of a trial, and its events. Raises UsageError."""
+    from share.lab.study.trials import EVENTS, planned_trials, trial_folder
+
+    planned = planned_trials(plan).get(trial)
+    if planned is None:
+        raise UsageError(f"{trial}: the plan has no such trial; they are named p01-1, p01-2 and so on")
+    path = trial_folder(folder, *planned[:2]) / EVENTS
+    if not path.exists():
+        raise UsageError(f"{path}: there is none; the trial was not run")
+    return planned, path
+
+
+def _floor(file: str, bodies: Mapping[str, MocapTrajectory | None], text: str, up: str) -> PlanarPose:
+    """Return where the floor's marker is in the world with z up. Raises UsageError."""
+    from share.lab.mocap.files import pick_body
+    from share.lab.study.mocap_judge import floor_in_world
+    from share.robot.planar import PlanarPose
+
+    if text in bodies:
+        _, marker = pick_body(file, bodies, text, "floor", "--floor")
+        return floor_in_world(marker.T[len(marker.T) // 2], up)
+    try:
+        x, y, deg = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = deg = math.nan
+    if not max(abs(x), abs(y), abs(deg)) <= 1e4:
+        listed = ", ".join(name for name in bodies if name) or "none with a name"
+        raise UsageError(f"--floor {text}: neither X,Y,DEG nor a body of {file}; it has {listed}")
+    return PlanarPose(x, y, math.radians(deg))
+
+
+def _print_goals(
+    before: TrialRecord, after: TrialRecord, plan: StudyPlan, lines: Sequence[Mapping[str, Any]]
+) -> None:
+    """Print each goal as the map and as the motion capture have it, and a note where they are far apart."""
+    rows = [
+        [
+            "goal",
+            "spot",
+            "reached after, s: by the map",
+            "by motion capture",
+            "final distance, m",
+            "",
+            "apart, m",
+        ]
+    ]
+    apart = {
+        line["goal"]: math.dist(line["robot_m"], line["robot_by_map_m"])
+        for line in lines
+        if line["event"] == "call" and None not in (line["robot_m"], line["robot_by_map_m"])
+    }
+    for number, goal in sorted(after.goals.items()):
+        both = [one.goals[number] for one in (before, after)]
+        times = [_number(one.reached_s(plan.success), "no") for one in both]
+        distances = [_number(one.stops[-1].distance_m if one.stops else math.nan) for one in both]
+        rows.append([str(number), str(goal.spot), *times, *distances, _number(apart.get(number, math.nan))])
+    click.echo(aligned_table(rows))
+    if apart and sorted(apart.values())[len(apart) // 2] > _FAR_M:
+        print_note(
+            "--floor", f"map and motion capture are over {_FAR_M:g} m apart at most calls; is it right?"
+        )
+
+
+def _number(value: float, missing: str = "") -> str:
+    return missing if math.isnan(value) else f"{value:.2f}"
