@@ -40,7 +40,7 @@ _FAR_M = 0.5  # robot by the map and by the motion capture, at the median: the f
     metavar="BODY|X,Y,DEG",
     help="Where the floor's marker is: a rigid body there, or its place and heading with z up.",
 )
-@click.option("--up", type=click.Choice(["z", "y"]), default="z", help="Up axis of the file.")
+@click.option("--up", type=click.Choice(["z", "y"]), default="z", help="Up axis of the file, z or y.")
 @click.option(
     "--offset",
     type=float,
@@ -73,7 +73,7 @@ def judge(
     from share.files.json_file import own_format_errors, read_json_lines
     from share.files.writing import atomic_write, check_replaceable
     from share.lab.mocap.files import pick_body, read_bodies
-    from share.lab.study.mocap_judge import RobotTrack, judged, match_clocks
+    from share.lab.study.mocap_judge import ClockMatch, RobotTrack, judged, match_clocks
     from share.lab.study.plan import read_plan
     from share.lab.study.trials import EVENTS_BY_MAP, MAX_LINES_BYTES, read_trial
 
@@ -92,15 +92,15 @@ def judge(
     track = RobotTrack.of(mocap, _floor(str(mocap_file), bodies, floor, up), up)
     try:
         with own_format_errors(source):
-            clock = None if offset is not None else match_clocks(track, events)
-            lines = judged(events, plan, track, offset if clock is None else clock.offset_s)
+            clock = match_clocks(track, events) if offset is None else ClockMatch(offset, math.nan, math.nan)
+            lines = judged(events, plan, track, clock.offset_s)
     except DataError as error:
         raise DataError(f"{mocap_file}: {error}") from None
     check_replaceable(path)
     if not kept.exists():
         atomic_write(kept, path.read_bytes())
     atomic_write(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-    if clock is not None:
+    if offset is None:
         click.echo(
             f"clocks: offset {clock.offset_s:.2f} s; driving and standing agree to {clock.agreement:.2f}, at "
             f"the next best offset to {clock.next_agreement:.2f}"

@@ -82,7 +82,8 @@ class RobotTrack:
         i, j = np.searchsorted(self.t_s, [from_s, to_s])
         for k in range(i, j):
             if self.is_seen[k]:
-                yield RobotSample(float(self.t_s[k]), *map(float, self.xy[k]), float(self.yaw[k]))
+                x, y = self.xy[k].tolist()
+                yield RobotSample(float(self.t_s[k]), x, y, float(self.yaw[k]))
 
     def seen_part(self, from_s: float, to_s: float) -> float:
         """Return the part of a time range in which it was seen."""
