@@ -18,6 +18,7 @@ from share.types import AgentKind, Frame, ImuBatch
 from share.wire.messages import Hello
 
 READ_AHEAD = 30  # frames decoded before they are due
+MAX_PREDICTED_NS = 500_000_000  # of poses by the IMU alone; then a frame is tracked, however late
 _WAIT_S = 0.1
 _DROP_WARNING_S = 2.0  # how long a warning about dropped images is shown
 _TOO_SLOW = "too slow for the camera: images are dropped"
@@ -149,23 +150,33 @@ class LiveArrivals:
 
 
 class LateFrameDropper:
-    """Judges which frames come too late to be tracked (policy `drop_late`), and keeps their IMU samples."""
+    """Judges which frames come too late to be tracked (policy `drop_late`), and keeps their IMU samples.
+
+    At most for `MAX_PREDICTED_NS`: a machine that is too slow even to leave frames out would else never track
+    one again, and integrate more samples for each."""
 
     def __init__(self, late_ms: float) -> None:
         """late_ms: delay from which a frame is not tracked; 0: all are."""
         self._late_ns = late_ms * 1e6
         self._skipped_imu = ImuBatch.empty()
+        self._tracked_ns: int | None = None  # stamp of the last tracked frame
         self.dropped = 0  # frames
 
     def judge(self, frame: Frame, late_ns: int, has_next: bool) -> tuple[Frame, bool]:
         """Return `frame` with all IMU samples since the last one that was not late, and whether it is late.
 
-        late_ns: time since it arrived. A frame is late only if a later one waits (`has_next`).
+        late_ns: time since it arrived. A frame is late only if a later one waits (`has_next`), and one was
+        tracked shortly before.
         """
         if len(self._skipped_imu):
             frame = replace(frame, imu=self._skipped_imu.concatenate(frame.imu))
-        is_late = has_next and 0 < self._late_ns < late_ns
+        is_predictable = (
+            self._tracked_ns is not None and frame.stamp_ns - self._tracked_ns <= MAX_PREDICTED_NS
+        )
+        is_late = has_next and 0 < self._late_ns < late_ns and is_predictable
         self._skipped_imu = frame.imu if is_late else ImuBatch.empty()
+        if not is_late:
+            self._tracked_ns = frame.stamp_ns
         self.dropped += is_late
         return frame, is_late
 

@@ -115,12 +115,14 @@ def frame_with_imu(k: int) -> Frame:
 
 def test_a_frame_is_late_if_a_later_one_waits() -> None:
     late = LateFrameDropper(20.0)
+    late.judge(frame_with_imu(0), 0, has_next=True)
     judged = [late.judge(frame_with_imu(k), ms * MS, has_next=True)[1] for k, ms in enumerate((19, 21, 21))]
     assert judged == [False, True, True] and late.dropped == 2
 
 
 def test_each_frame_has_all_imu_samples_since_the_last_that_was_tracked() -> None:
     late = LateFrameDropper(20.0)
+    late.judge(frame_with_imu(0), 0, has_next=True)
     late.judge(frame_with_imu(1), 30 * MS, has_next=True)
     second, is_late = late.judge(frame_with_imu(2), 30 * MS, has_next=True)
     assert is_late and second.imu.stamps_ns.tolist() == [10 * MS, 15 * MS, 20 * MS, 25 * MS]
@@ -139,6 +141,15 @@ def test_no_frame_is_late_without_a_limit_or_a_later_frame(late_ms: float, anoth
     frame = frame_with_imu(1)
     assert late.judge(frame, 10**12, another) == (frame, False)
     assert late.dropped == 0
+
+
+def test_a_machine_that_is_always_late_still_tracks_twice_a_second() -> None:
+    """A recording whose frames wait: each would be predicted from the last one that was tracked."""
+    late = LateFrameDropper(20.0)
+    judged = [late.judge(frame_with_imu(k), 10**12, has_next=True) for k in range(500)]  # 5 s
+    tracked = [frame.index for frame, is_late in judged if not is_late]
+    assert len(tracked) == 10 and max(np.diff(tracked)) == 51
+    assert max(len(frame.imu) for frame, _ in judged) == 2 * 51
 
 
 def test_a_headset_with_an_imu_stays_fresh_by_default() -> None:
