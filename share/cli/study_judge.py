@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from share.cli import options
-from share.cli.terminal import aligned_table, print_note
+from share.cli.terminal import aligned_table
 from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -42,10 +43,9 @@ _FAR_M = 0.5  # robot by the map and by the motion capture, at the median: the f
 )
 @click.option("--up", type=click.Choice(["z", "y"]), default="z", help="Up axis of the file, z or y.")
 @click.option(
-    "--offset",
-    type=float,
-    metavar="S",
-    help="Its clock minus the trial's, s.  [default: found by the robot's motion]",
+    "--zero",
+    metavar="UTC",
+    help="When its clock was 0, such as 2026-11-28T10:03:12.34.  [default: found by the robot's motion]",
 )
 @options.rotations
 def judge(
@@ -55,7 +55,7 @@ def judge(
     body: str | None,
     floor: str,
     up: str,
-    offset: float | None,
+    zero: str | None,
     rotations: str,
 ) -> None:
     """Judge TRIAL (such as p01-2) of the study in DIR by a motion capture of the robot.
@@ -71,39 +71,51 @@ def judge(
     import json
 
     from share.files.json_file import own_format_errors, read_json_lines
-    from share.files.writing import atomic_write, check_replaceable
+    from share.files.writing import atomic_write
     from share.lab.mocap.files import pick_body, read_bodies
     from share.lab.study.mocap_judge import ClockMatch, RobotTrack, judged, match_clocks
     from share.lab.study.plan import read_plan
-    from share.lab.study.trials import EVENTS_BY_MAP, MAX_LINES_BYTES, read_trial
+    from share.lab.study.trials import EVENTS, EVENTS_BY_MAP, MAX_LINES_BYTES, read_trial
 
     plan = read_plan(folder)
     planned, path = _planned_trial(folder, plan, trial)
     kept = path.with_name(EVENTS_BY_MAP)
-    source = kept if kept.exists() else path
-    before = read_trial(source, plan, *planned)
-    if not before.is_complete:
-        raise UsageError(f"{trial}: is not carried through; finish it by share study run")
+    newest = read_trial(path, plan, *planned)
+    is_judged = newest.judge == "mocap" and kept.exists()
+    if newest.judge == "map" and kept.exists() and kept.read_bytes() != path.read_bytes():
+        raise UsageError(f"{kept}: is of another trial than {EVENTS}; move it away")
+    source = kept if is_judged else path
+    before = read_trial(source, plan, *planned) if is_judged else newest
+    if before.is_left or not before.is_complete:
+        raise UsageError(f"{trial}: was not carried through, so it counts in no statistics")
     if before.judge != "map":
-        raise UsageError(f"{source}: is judged by {before.judge} already, and {EVENTS_BY_MAP} is missing")
+        raise UsageError(f"{source}: is judged by {before.judge}, and there is no {EVENTS_BY_MAP}")
     events = read_json_lines(source, MAX_LINES_BYTES)
     bodies = read_bodies(mocap_file, rotations)
     _, mocap = pick_body(str(mocap_file), bodies, body, "robot", "--body")
     track = RobotTrack.of(mocap, _floor(str(mocap_file), bodies, floor, up), up)
     try:
         with own_format_errors(source):
-            clock = match_clocks(track, events) if offset is None else ClockMatch(offset, math.nan, math.nan)
-            lines = judged(events, plan, track, clock.offset_s)
+            clock = (
+                match_clocks(track, events) if zero is None else ClockMatch(_utc_s(zero), math.nan, math.nan)
+            )
+            lines = judged(events, plan, track, clock.zero_utc_s)
     except DataError as error:
         raise DataError(f"{mocap_file}: {error}") from None
-    check_replaceable(path)
+    apart_m = _median_apart_m(lines)
+    if apart_m > _FAR_M and zero is None:
+        raise UsageError(
+            f"map and motion capture have the robot {apart_m:.2f} m apart at most calls: is it this trial's "
+            "take, and are --floor, --up and --body right? If the map was so wrong, give --zero"
+        )
     if not kept.exists():
         atomic_write(kept, path.read_bytes())
     atomic_write(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
-    if offset is None:
+    if zero is None:
+        when = datetime.fromtimestamp(clock.zero_utc_s, UTC).isoformat(timespec="milliseconds")[:-6]
         click.echo(
-            f"clocks: offset {clock.offset_s:.2f} s; driving and standing agree to {clock.agreement:.2f}, at "
-            f"the next best offset to {clock.next_agreement:.2f}"
+            f"its clock was 0 at {when} UTC (--zero for other trials of this take); driving and standing "
+            f"agree to {clock.agreement:.2f}, at the next best time to {clock.next_agreement:.2f}"
         )
     _print_goals(before, read_trial(path, plan, *planned), plan, lines)
     click.echo(f"{path}: judged by motion capture; what the map said: {kept}")
@@ -128,7 +140,7 @@ def _floor(file: str, bodies: Mapping[str, MocapTrajectory | None], text: str, u
     from share.lab.study.mocap_judge import floor_in_world
     from share.robot.planar import PlanarPose
 
-    if text in bodies:
+    if text.lower() in (name.lower() for name in bodies):
         _, marker = pick_body(file, bodies, text, "floor", "--floor")
         return floor_in_world(marker.T[len(marker.T) // 2], up)
     try:
@@ -156,21 +168,36 @@ def _print_goals(
             "apart, m",
         ]
     ]
-    apart = {
-        line["goal"]: math.dist(line["robot_m"], line["robot_by_map_m"])
-        for line in lines
-        if line["event"] == "call" and None not in (line["robot_m"], line["robot_by_map_m"])
-    }
+    apart = _apart_m(lines)
     for number, goal in sorted(after.goals.items()):
         both = [one.goals[number] for one in (before, after)]
         times = [_number(one.reached_s(plan.success), "no") for one in both]
         distances = [_number(one.stops[-1].distance_m if one.stops else math.nan) for one in both]
         rows.append([str(number), str(goal.spot), *times, *distances, _number(apart.get(number, math.nan))])
     click.echo(aligned_table(rows))
-    if apart and sorted(apart.values())[len(apart) // 2] > _FAR_M:
-        print_note(
-            "--floor", f"map and motion capture are over {_FAR_M:g} m apart at most calls; is it right?"
-        )
+
+
+def _apart_m(lines: Sequence[Mapping[str, Any]]) -> dict[int, float]:
+    """Return how far apart map and motion capture have the robot at the calls, by goal."""
+    return {
+        line["goal"]: math.dist(line["robot_m"], line["robot_by_map_m"])
+        for line in lines
+        if line["event"] == "call" and line["robot_by_map_m"] is not None
+    }
+
+
+def _median_apart_m(lines: Sequence[Mapping[str, Any]]) -> float:
+    apart = sorted(_apart_m(lines).values())
+    return apart[len(apart) // 2] if apart else 0.0
+
+
+def _utc_s(text: str) -> float:
+    """Return a UTC time, s since 1970. Raises UsageError."""
+    try:
+        when = datetime.fromisoformat(text)
+        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
+        raise UsageError(f"--zero {text:.40}: is not a UTC time such as 2026-11-28T10:03:12.34") from None
 
 
 def _number(value: float, missing: str = "") -> str:

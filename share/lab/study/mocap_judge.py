@@ -1,16 +1,17 @@
 """Judges a trial by motion capture: where the robot truly was, in place of where the map had it.
 
-A trial's events have times on the trial's clock, the motion capture has another. The two are matched by when
-the robot drove and when it stood, which needs no place: a map that is wrong does not bias it. Cubes then
-count as lying at their planned spots, measured on the floor; by the map they drift with the headset.
+A trial's events have UTC, by the clock of the machine that led it; the motion capture has a clock of its own.
+The two are matched by when the robot drove and when it stood, which needs no place: a map that is wrong does
+not bias it, but the delay does with which the robot's places came. Cubes count as lying at their planned
+spots, measured on the floor; by the map they drift with the headset.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,14 @@ from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.lab.study.plan import StudyPlan
-from share.lab.study.standstill import BY_TRUTH, MotionLimits, MotionWatch, RobotSample
+from share.lab.study.standstill import BY_MAP, BY_TRUTH, MotionWatch, RobotSample
 from share.robot.planar import PlanarPose, flattened
 from share.types import F64
 
-BY_MOCAP: MotionLimits = BY_TRUTH
-MIN_SEEN = 0.5  # of the time under way, in which the motion capture must see the robot
+MAX_HIDDEN_S = 2.0  # that the motion capture may not see the robot under way
+BY_MOCAP = replace(BY_TRUTH, still_s=BY_MAP.still_s, max_gap_s=MAX_HIDDEN_S + 0.2)
+_SETTLES_S = 5.0  # after the navigator is done: what the robot does later belongs to no goal
+_LONGEST_S = 86_400.0  # of a trial
 _STEP_S = 0.05  # of the search for the offset, and between two places that are judged
 _WINDOW_S = 0.5  # over which speed is taken
 _DRIVES_M_S, _TURNS_RAD_S = 0.04, 0.15
@@ -36,10 +39,10 @@ UP_AXES = tuple(_UPS)
 
 @dataclass(frozen=True)
 class ClockMatch:
-    """offset_s: the motion capture's clock minus the trial's. agreement: of driving and standing there, -1 to
-    1; next_agreement: at the best offset elsewhere."""
+    """zero_utc_s: UTC, s since 1970, at which the motion capture's clock was 0. agreement: of driving and
+    standing by it, -1 to 1; next_agreement: of the best one elsewhere."""
 
-    offset_s: float
+    zero_utc_s: float
     agreement: float
     next_agreement: float
 
@@ -85,10 +88,16 @@ class RobotTrack:
                 x, y = self.xy[k].tolist()
                 yield RobotSample(float(self.t_s[k]), x, y, float(self.yaw[k]))
 
-    def seen_part(self, from_s: float, to_s: float) -> float:
-        """Return the part of a time range in which it was seen."""
+    def at(self, t_s: float) -> RobotSample:
+        """Return where it was, between samples and over gaps in a straight line."""
+        x, y, yaw = (float(np.interp(t_s, self.t_s, one)) for one in (*self.xy.T, self.yaw))
+        return RobotSample(t_s, x, y, yaw)
+
+    def longest_gap_s(self, from_s: float, to_s: float) -> float:
+        """Return the longest time within a time range in which it was not seen."""
         i, j = np.searchsorted(self.t_s, [from_s, to_s])
-        return float(self.is_seen[i:j].sum()) * _STEP_S / max(to_s - from_s, _STEP_S)
+        seen_s = self.t_s[i:j][self.is_seen[i:j]]
+        return float(np.diff(np.concatenate([[from_s], seen_s, [to_s]])).max())
 
 
 def floor_in_world(T_world_marker: F64, up: str) -> PlanarPose:
@@ -100,16 +109,17 @@ def floor_in_world(T_world_marker: F64, up: str) -> PlanarPose:
 # ---------------------------------------------------------------- clocks
 
 
-def steady_times(events: Sequence[Mapping[str, Any]]) -> list[float]:
-    """Return the time of each event, s, on a clock that goes on between the parts of an interrupted trial."""
-    out, shift_s, first_utc = list[float](), 0.0, None
-    is_resumed = sum(event["event"] == "begin" for event in events) > 1
+def utc_times(events: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Return the UTC of each event, s since 1970, by the `utc` of the begin before it. Raises DataError where
+    that does not rise, or not by less than a day."""
+    out, zero_s = list[float](), 0.0
     for event in events:
-        if event["event"] == "begin" and is_resumed:
-            utc_s = datetime.fromisoformat(event["utc"]).timestamp()
-            first_utc = utc_s - event["t_s"] if first_utc is None else first_utc
-            shift_s = utc_s - first_utc - event["t_s"]
-        out.append(event["t_s"] + shift_s)
+        if event["event"] == "begin":
+            when = datetime.fromisoformat(event["utc"])
+            zero_s = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp() - event["t_s"]
+        out.append(zero_s + event["t_s"])
+    if out and not (max(out) - out[0] <= _LONGEST_S and all(np.diff(out) > -_WINDOW_S)):
+        raise DataError("the clock of the machine that led the trial was set in between; it cannot be judged")
     return out
 
 
@@ -117,7 +127,7 @@ def expected_drives(events: Sequence[Mapping[str, Any]]) -> list[tuple[float, fl
     """Return time ranges, s, in which the robot drove (1) or stood (-1) by the events: it stands from a call
     until shortly before its first motion is seen, drives from there until it stands, and stands from the end
     of the goal to the next call."""
-    times, out = steady_times(events), list[tuple[float, float, float]]()
+    times, out = utc_times(events), list[tuple[float, float, float]]()
     since: tuple[float, float] | None = None  # since when it is known to drive or to stand, and which
     for event, t_s in zip(events, times, strict=True):
         kind = event["event"]
@@ -131,11 +141,11 @@ def expected_drives(events: Sequence[Mapping[str, Any]]) -> list[tuple[float, fl
 
 
 def match_clocks(track: RobotTrack, events: Sequence[Mapping[str, Any]]) -> ClockMatch:
-    """Return the offset at which the robot drives when the events say so. Raises DataError where no offset or
+    """Return the clock by which the robot drives when the events say so. Raises DataError where none or
     several fit."""
     ranges = expected_drives(events)
     if not any(does > 0 for _, _, does in ranges):
-        raise DataError("the robot never drove in this trial, so the clocks cannot be matched; give --offset")
+        raise DataError("the robot never drove in this trial, so the clocks cannot be matched; give --zero")
     start_s, end_s = ranges[0][0], max(end for _, end, _ in ranges)
     at = start_s + _STEP_S * np.arange(math.ceil((end_s - start_s) / _STEP_S) + 1)
     expected = np.zeros(len(at))
@@ -147,7 +157,7 @@ def match_clocks(track: RobotTrack, events: Sequence[Mapping[str, Any]]) -> Cloc
     best = _middle_of_peak(score)
     offsets_s = track.t_s[0] - start_s + _STEP_S * (np.arange(len(score)) - (len(expected) - 1))
     elsewhere = score[np.abs(offsets_s - offsets_s[best]) > _PEAK_S]
-    found = ClockMatch(float(offsets_s[best]), float(score[best]), float(elsewhere.max(initial=-1.0)))
+    found = ClockMatch(-float(offsets_s[best]), float(score[best]), float(elsewhere.max(initial=-1.0)))
     if found.agreement < _MIN_AGREEMENT:
         raise DataError(
             f"driving and standing agree at no time offset ({found.agreement:.2f} at best, {_MIN_AGREEMENT} "
@@ -155,8 +165,7 @@ def match_clocks(track: RobotTrack, events: Sequence[Mapping[str, Any]]) -> Cloc
         )
     if found.agreement - found.next_agreement < _MIN_LEAD:
         raise DataError(
-            f"two time offsets fit alike, {found.offset_s:.1f} s ({found.agreement:.2f}) and another "
-            f"({found.next_agreement:.2f}); give --offset"
+            f"two time offsets fit alike ({found.agreement:.2f} and {found.next_agreement:.2f}); give --zero"
         )
     return found
 
@@ -177,90 +186,98 @@ def _middle_of_peak(score: F64) -> int:
 # ---------------------------------------------------------------- judging
 
 
+@dataclass(frozen=True)
+class _Goal:
+    """A call and what belongs to it. index: of the call among the events. zero_s: UTC of the trial's clock
+    there. called_s, over_s, end_s: UTC of the call, of the navigator's end (inf: none), of the last that
+    counts."""
+
+    index: int
+    call: Mapping[str, Any]
+    zero_s: float
+    called_s: float
+    over_s: float
+    end_s: float
+
+    @staticmethod
+    def of(events: Sequence[Mapping[str, Any]], times: Sequence[float], index: int) -> _Goal:
+        call, later = events[index], range(index + 1, len(events))
+        over = next((k for k in later if events[k]["event"] in ("status", "call", "begin")), None)
+        has_ended = over is not None and events[over]["event"] == "status"
+        over_s = times[over] if over is not None and has_ended else math.inf
+        ends = ("call", "begin", "interrupted") if has_ended else ("call", "begin", "interrupted", "end")
+        next_s = next((times[k] for k in later if events[k]["event"] in ends), math.inf)
+        end_s = min(next_s, over_s + _SETTLES_S, times[index] + _LONGEST_S)
+        return _Goal(index, call, times[index] - call["t_s"], times[index], over_s, end_s)
+
+
 def judged(
-    events: Sequence[Mapping[str, Any]], plan: StudyPlan, track: RobotTrack, offset_s: float
+    events: Sequence[Mapping[str, Any]], plan: StudyPlan, track: RobotTrack, zero_utc_s: float
 ) -> list[dict[str, Any]]:
     """Return a complete trial's events with robot, motion and standstills by the motion capture, and cubes at
     their spots. What the map said stays beside it: `cube_by_map_m`, `robot_by_map_m`. Raises UsageError where
-    the robot was hardly seen."""
-    times, out = steady_times(events), list[dict[str, Any]]()
-    goals = [k for k, event in enumerate(events) if event["event"] == "call"]
-    ends = [_end_of_goal(events, k) for k in goals]
-    under_way_s = sum(times[end] - times[k] for k, end in zip(goals, ends, strict=True))
-    seen_s = sum(
-        track.seen_part(times[k] + offset_s, times[end] + offset_s) * (times[end] - times[k])
-        for k, end in zip(goals, ends, strict=True)
-    )
-    if seen_s < MIN_SEEN * under_way_s:
-        raise UsageError(
-            f"the motion capture saw the robot in {100 * seen_s / max(under_way_s, 1e-9):.0f} % of the time "
-            f"under way; {100 * MIN_SEEN:.0f} % are needed"
-        )
-    for event in events:
+    the robot was hidden under way."""
+    times, out = utc_times(events), list[tuple[float, float, dict[str, Any]]]()
+    calls = [k for k, event in enumerate(events) if event["event"] == "call"]
+    goals = [_Goal.of(events, times, k) for k in calls]
+    _check_seen({one.call["goal"]: one for one in goals}.values(), track, zero_utc_s)
+    for k, event in enumerate(events):
         if event["event"] == "begin":
-            out.append({**event, "judge": "mocap"})
+            out.append((event["t_s"], k, {**event, "judge": "mocap"}))
+        elif event["event"] == "end":
+            out.append((math.inf, k, dict(event)))
         elif event["event"] not in ("call", "moves", "stands"):
-            out.append(dict(event))
-    for k, end in zip(goals, ends, strict=True):
-        shift_s = times[k] - events[k]["t_s"] + offset_s
-        out += _goal_events(events[k : end + 1], plan, track, shift_s)
-    order = {"begin": 0, "end": 2}
-    return sorted(out, key=lambda event: (event["t_s"], order.get(event["event"], 1)))
+            out.append((event["t_s"], k, dict(event)))
+    for goal in goals:
+        out += [(line["t_s"], goal.index, line) for line in _goal_events(goal, plan, track, zero_utc_s)]
+    return [line for _, _, line in sorted(out, key=lambda one: one[:2])]
 
 
-def _end_of_goal(events: Sequence[Mapping[str, Any]], call: int) -> int:
-    """Return the index of the event that ends a called goal: the next call, or the end of this part."""
-    later = range(call + 1, len(events))
-    return next(
-        (k for k in later if events[k]["event"] in ("call", "begin", "interrupted", "end")), len(events) - 1
-    )
+def _check_seen(goals: Iterable[_Goal], track: RobotTrack, zero_utc_s: float) -> None:
+    """Raise UsageError where the robot was hidden from a call until the navigator was done, or for long at
+    the end."""
+    hidden = {
+        goal.call["goal"]: track.longest_gap_s(
+            goal.called_s - zero_utc_s, min(goal.over_s, goal.end_s) - zero_utc_s
+        )
+        for goal in goals
+    }
+    if bad := {goal: gap_s for goal, gap_s in hidden.items() if gap_s > MAX_HIDDEN_S}:
+        listed = ", ".join(f"{goal} ({gap_s:.1f} s)" for goal, gap_s in sorted(bad.items()))
+        raise UsageError(
+            f"the motion capture did not see the robot for more than {MAX_HIDDEN_S:g} s under way to goal "
+            f"{listed}; it cannot judge this trial"
+        )
 
 
 def _goal_events(
-    events: Sequence[Mapping[str, Any]], plan: StudyPlan, track: RobotTrack, shift_s: float
+    goal: _Goal, plan: StudyPlan, track: RobotTrack, zero_utc_s: float
 ) -> Iterator[dict[str, Any]]:
-    """Yield call, first motion and standstills of one goal. shift_s: the track's clock minus the trial's."""
-    call, goal = events[0], events[0]["goal"]
-    x, y = plan.spots[call["spot"] - 1]
-    samples = list(track.samples(call["t_s"] + shift_s, events[-1]["t_s"] + shift_s))
-    at_call = samples[0] if samples and samples[0].t_s - shift_s - call["t_s"] < _WINDOW_S else None
-    by_map = {"cube_by_map_m": call["cube_m"], "robot_by_map_m": call["robot_m"]}
+    """Yield call, first motion and standstills of one goal. A robot that need not drive counts as standing
+    once the navigator is done."""
+    number, shift_s = goal.call["goal"], zero_utc_s - goal.zero_s  # from the track's clock to the trial's
+    x, y = plan.spots[goal.call["spot"] - 1]
+    at_call = track.at(goal.called_s - zero_utc_s)
     yield {
-        **{name: value for name, value in call.items() if name != "path_m"},
+        **{name: value for name, value in goal.call.items() if name != "path_m"},
         "cube_m": [round(x, 4), round(y, 4)],
-        "robot_m": None if at_call is None else _xy(at_call),
-        **by_map,
+        "robot_m": _xy(at_call),
+        "cube_by_map_m": goal.call["cube_m"],
+        "robot_by_map_m": goal.call["robot_m"],
     }
-    over_s = min(
-        (one["t_s"] for one in events if one["event"] == "status" and one["goal"] == goal), default=math.inf
-    )
-    yield from _motion_events(call["t_s"], goal, samples, at_call, over_s, shift_s)
-
-
-def _motion_events(
-    called_s: float,
-    goal: int,
-    samples: Iterable[RobotSample],
-    at_call: RobotSample | None,
-    over_s: float,
-    shift_s: float,
-) -> Iterator[dict[str, Any]]:
-    """Yield `moves` and `stands`. over_s: when the navigator was done, from when on a robot that need not
-    drive counts as standing."""
     watch, has_moved, stood = MotionWatch(at_call, BY_MOCAP), False, False
-    for sample in samples:
+    for sample in track.samples(goal.called_s - zero_utc_s, goal.end_s - zero_utc_s):
         watch.add(sample)
-        now_s = sample.t_s - shift_s
         if watch.moves_s is not None and not has_moved:
             has_moved = True
-            yield {"event": "moves", "t_s": round(watch.moves_s - shift_s, 3), "goal": goal}
+            yield {"event": "moves", "t_s": round(watch.moves_s + shift_s, 3), "goal": number}
         since_s = watch.stands_since()
-        counts = since_s is not None and (has_moved or now_s >= over_s)
+        counts = since_s is not None and (has_moved or sample.t_s + zero_utc_s >= goal.over_s)
         if since_s is not None and counts and not stood:
             yield {
                 "event": "stands",
-                "t_s": round(max(called_s, since_s - shift_s), 3),
-                "goal": goal,
+                "t_s": round(max(goal.call["t_s"], since_s + shift_s), 3),
+                "goal": number,
                 "robot_m": _xy(sample),
                 "path_m": round(watch.path_m, 4),
             }

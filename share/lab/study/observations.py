@@ -90,7 +90,7 @@ def read_study(study: Path, plan: StudyPlan, rule: SuccessRule) -> Observations:
     if repeated:
         measures[REPEATED_CALLS] = recalled
     answers, choices = _read_answers(study / ANSWERS, plan)
-    judges = Counter(record.judge for record in records.values())
+    judges = Counter(record.judge for record in records.values() if record.is_complete)
     far = _far_cubes(records.values(), plan, rule)
     done = sum(record.is_complete for record in records.values())
     notes = (*_broken_note(records), *_repeated_note(repeated), *far, *_room_notes(records.values()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from share.robot.planar import PlanarPose
 
 PLAN, KEY = small_plan()
 P01 = PLAN.participants[0].name
+BEGAN_S = datetime(2026, 11, 28, 10, tzinfo=UTC).timestamp()
 OFFSET_S = 731.37  # motion capture's clock minus the trial's
 FLOOR = PlanarPose(3.2, -1.4, 2.1)  # in the motion capture's world
 PAUSE_S = 300.0  # of an interrupted trial
@@ -144,7 +146,7 @@ def judge(folder: Path, mocap: Path, *more: str, trial: str = f"{P01}-1") -> Any
 def test_clocks_are_matched_by_driving_and_standing(seed: int, up: str) -> None:
     track = RobotTrack.of(mocap_of(seed, up), FLOOR, up)
     found = match_clocks(track, events_by_map(seed, 0.3))
-    assert found.offset_s == pytest.approx(OFFSET_S, abs=0.3)
+    assert found.zero_utc_s == pytest.approx(BEGAN_S - OFFSET_S, abs=0.3)
     assert found.agreement > 0.8
 
 
@@ -154,7 +156,10 @@ def test_a_map_that_drifts_does_not_judge_itself(tmp_path: Path) -> None:
     rule = SuccessRule()
     before = read_trials(folder, PLAN)[P01, 1]
     assert not any(goal.reached_s(rule) > 0 for goal in before.goals.values())
-    result = judge(folder, write_tum(tmp_path / "take.tum", mocap_of(1)))
+    zero = datetime.fromtimestamp(BEGAN_S - OFFSET_S, UTC).isoformat()
+    take = write_tum(tmp_path / "take.tum", mocap_of(1))
+    assert "1.20 m apart at most calls" in str(judge(folder, take).exception)
+    result = judge(folder, take, "--zero", zero)
     assert result.exit_code == 0, result.output
     after = read_trials(folder, PLAN)[P01, 1]
     assert after.judge == "mocap" and after.is_complete
@@ -230,7 +235,9 @@ def write_motive(path: Path, bodies: dict[str, np.ndarray], at: MocapTrajectory)
         (("--floor", "1,2"), "neither X,Y,DEG nor a body of"),
         (("--floor", "nan,0,0"), "neither X,Y,DEG nor a body of"),
         (("--body", "Robot"), "has no body 'Robot'"),
-        (("--offset", "1e9"), "saw the robot in 0 % of the time under way; 50 % are needed"),
+        (("--zero", "2026-11-28T09:00"), "did not see the robot for more than 2 s under way to goal 1"),
+        (("--zero", "noon"), "is not a UTC time such as"),
+        (("--zero", "9999-99-99"), "is not a UTC time such as"),
     ],
 )
 def test_wrong_options_leave_the_trial_as_it_was(tmp_path: Path, more: tuple[str, ...], said: str) -> None:
@@ -254,10 +261,91 @@ def test_what_is_not_there_or_not_finished_is_refused(tmp_path: Path) -> None:
     events = events_by_map(1, 0.0)
     folder = study_with(tmp_path / "study", events[:-1])
     take = write_tum(tmp_path / "take.tum", mocap_of(1))
-    assert "is not carried through" in str(judge(folder, take).exception)
+    assert "was not carried through" in str(judge(folder, take).exception)
     assert "the plan has no such trial" in str(judge(folder, take, trial="p99-1").exception)
     assert "the trial was not run" in str(judge(folder, take, trial=f"{P01}-2").exception)
     broken = json.loads(json.dumps(events))
     broken[0]["judge"] = "mocap"
     write_lines(trial_folder(folder, P01, 1) / EVENTS, broken)
-    assert "is judged by mocap already" in str(judge(folder, take).exception)
+    assert "is judged by mocap, and there is no events-map.jsonl" in str(judge(folder, take).exception)
+
+
+def hidden(mocap: MocapTrajectory, from_s: float, to_s: float) -> MocapTrajectory:
+    """The same without the samples in a time range of the trial's clock."""
+    t_s = mocap.stamps_ns / 1e9 - OFFSET_S
+    keep = (t_s < from_s) | (t_s > to_s)
+    return MocapTrajectory(mocap.stamps_ns[keep], mocap.T[keep])
+
+
+def test_a_robot_that_was_hidden_is_not_judged_and_missed(tmp_path: Path) -> None:
+    events = events_by_map(1, 0.0)
+    folder = study_with(tmp_path / "study", events)
+    stood_s = [event["t_s"] for event in events if event["event"] == "stands"][-1]
+    take = write_tum(tmp_path / "a.tum", hidden(mocap_of(1), stood_s - 2.5, stood_s + 1.0))
+    assert "under way to goal 2 (3.5 s)" in str(judge(folder, take).exception)
+    cut = hidden(mocap_of(1), stood_s - 3, 1e9)
+    assert "under way to goal 2" in str(judge(folder, write_tum(tmp_path / "b.tum", cut)).exception)
+    short = hidden(mocap_of(1), stood_s - 0.7, stood_s + 0.7)
+    assert judge(folder, write_tum(tmp_path / "c.tum", short)).exit_code == 0
+    goal = read_trials(folder, PLAN)[P01, 1].goals[2]
+    assert goal.stops[-1].s == pytest.approx(stood_s - goal.called_s, abs=1.5)
+
+
+def test_a_robot_that_stands_at_the_last_spot_already_has_come(tmp_path: Path) -> None:
+    """Goal 2 is called again and again; it does not drive, and the trial ends with the navigator's word."""
+    events = events_by_map(1, 0.0)[:-1]
+    call = next(one for one in events if one["event"] == "call" and one["goal"] == 2)
+    at = float(drive(1)[0][-1]) + 2.0
+    events.append({**call, "t_s": at, "robot_m": list(drive(1)[2][-1][1])})
+    events += [
+        {"event": "status", "t_s": at + 0.4, "goal": 2, "status": "arrived"},
+        {"event": "end", "t_s": at + 0.4},
+    ]
+    folder = study_with(tmp_path / "study", events)
+    assert judge(folder, write_tum(tmp_path / "take.tum", mocap_of(1))).exit_code == 0
+    record = read_trials(folder, PLAN)[P01, 1]
+    assert record.is_complete and record.goals[2].reached_s(SuccessRule()) < 1.0
+
+
+def test_what_the_robot_does_after_a_goal_is_not_the_goals(tmp_path: Path) -> None:
+    """The navigator gave up as soon as the robot was called, long before somebody drove it there."""
+    events = []
+    for event in events_by_map(1, 0.0):
+        if event.get("goal") != 2 or event["event"] == "call":
+            events.append(event)
+        if event.get("goal") == 2 and event["event"] == "call":
+            events.append({"event": "status", "t_s": event["t_s"] + 0.2, "goal": 2, "status": "failed"})
+    folder = study_with(tmp_path / "study", events)
+    zero = datetime.fromtimestamp(BEGAN_S - OFFSET_S, UTC).isoformat()
+    result = judge(folder, write_tum(tmp_path / "take.tum", mocap_of(1)), "--zero", zero)
+    assert result.exit_code == 0, result.output
+    assert math.isnan(read_trials(folder, PLAN)[P01, 1].goals[2].reached_s(SuccessRule()))
+
+
+def test_a_trial_that_was_run_anew_is_not_overwritten(tmp_path: Path) -> None:
+    folder = study_with(tmp_path / "study", events_by_map(1, 0.0))
+    path = trial_folder(folder, P01, 1) / EVENTS
+    assert judge(folder, write_tum(tmp_path / "old.tum", mocap_of(1))).exit_code == 0
+    write_lines(path, events_by_map(2, 0.0))
+    anew = path.read_text()
+    result = judge(folder, write_tum(tmp_path / "new.tum", mocap_of(2)))
+    assert "is of another trial than events.jsonl; move it away" in str(result.exception)
+    assert path.read_text() == anew
+
+
+@pytest.mark.parametrize("utc", ["1970-01-01T00:00:10+00:00", "2027-11-28T10:00:00+00:00"])
+def test_a_clock_that_was_set_in_between_is_said(tmp_path: Path, utc: str) -> None:
+    events = events_by_map(2, 0.0, breaks=True)
+    [second] = [one for one in events[1:] if one["event"] == "begin"]
+    second["utc"] = utc
+    folder = study_with(tmp_path / "study", events)
+    result = judge(folder, write_tum(tmp_path / "take.tum", mocap_of(2)))
+    assert "the clock of the machine that led the trial was set in between" in str(result.exception)
+
+
+def test_trials_that_were_left_are_no_change_of_judge(tmp_path: Path) -> None:
+    folder = study_with(tmp_path / "study", events_by_map(1, 0.0))
+    left = begin(PLAN, P01, 2, judge="map")
+    write_lines(trial_folder(folder, P01, 2) / EVENTS, [left])
+    assert judge(folder, write_tum(tmp_path / "take.tum", mocap_of(1))).exit_code == 0
+    assert not any("JUDGE CHANGES" in note for note in read_study(folder, PLAN, SuccessRule()).notes)
