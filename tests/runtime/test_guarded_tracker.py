@@ -25,8 +25,9 @@ from share.odometry.track_result import TrackResult
 from share.protocol import agent_events as ev
 from share.runtime import guarded_tracker
 from share.runtime.error_estimators import NoErrorEstimate
+from share.runtime.fault_guard import FaultGuard
 from share.runtime.frame_consumers import LocalTracking
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.guarded_tracker import GuardedTracker
 from share.types import TrackState
 from share.vision import corners
 
