@@ -46,7 +46,7 @@ def arrives(drive: Drive) -> None:
 
 
 def test_a_robot_arrives_where_a_wearer_points() -> None:
-    drive = Drive([PlanarPose(6.0, 4.0, 1.0)])
+    drive = Drive([GOAL])
     drive.run(60.0)
     [outcome] = drive.giver.outcomes
     assert outcome.is_reached and 0.05 < outcome.error_m <= REACHED_M and outcome.error_rad < 0.35
