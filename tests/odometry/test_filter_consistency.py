@@ -23,7 +23,7 @@ def nees(seeds, setup):
 @pytest.mark.parametrize("mono", [False, True])
 def test_nees(mono):
     low, high = BANDS[6]
-    found = nees(6, Setup(seconds=4.0, mono=mono))
+    found = nees(6, Setup(seconds=6.0, mono=mono))
     assert (low < found).all()
     assert (found < high).all()
 
