@@ -21,7 +21,8 @@ from share.library.checked_input import (
 )
 from share.recordings.images import decode_frame
 from share.runtime.error_estimators import NoErrorEstimate
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.pipeline import check_trackable
 from share.runtime.pose import Pose, tracked_pose
 from share.sensors.measurement import Measurement

@@ -44,8 +44,8 @@ from share.runtime.arrivals import (
     late_limit_ms,
 )
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate
+from share.runtime.fault_guard import FaultGuard
 from share.runtime.frame_consumers import FrameConsumer, LocalTracking, RemoteTracking
-from share.runtime.guarded_tracker import FaultGuard
 from share.runtime.output_writer import OutputWriter
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.pose import PoseSink, localised_pose

@@ -21,7 +21,7 @@ from share.net.transport import EdgeLink
 from share.protocol.edge_events import PeerMessageReceived
 from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver, EdgeObservers
-from share.runtime.guarded_tracker import FaultGuard
+from share.runtime.fault_guard import FaultGuard
 from share.runtime.run_files import EdgeFiles
 from share.runtime.served_room import ServedRoom
 from share.startup import HeapTrimmer

@@ -15,7 +15,8 @@ from share.odometry.track_result import TrackResult
 from share.protocol import agent_events as ev
 from share.runtime.arrivals import READ_AHEAD
 from share.runtime.error_estimators import ErrorEstimator
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.imu_bias_store import ImuBiasStore
 from share.runtime.source import Source
 from share.types import Frame, TrackState

@@ -16,7 +16,8 @@ from share.odometry.track_result import TrackResult
 from share.plain_data import to_mapping
 from share.recordings.trajectory import Trajectory
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.imu_bias_store import ImuBiasStore
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source

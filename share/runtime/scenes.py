@@ -13,7 +13,8 @@ from share.errors import DataError, UsageError
 from share.mapping.map_changes import StoredKeyframe, StoredMap, map_poses
 from share.recordings.exports.scene import Progress, Scene, SceneAgent, SceneView, known_points
 from share.recordings.trajectory import Trajectory, read_tum
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.offline_tracking import track_frames
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source

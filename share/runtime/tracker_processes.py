@@ -21,7 +21,6 @@ from share.protocol.edge_events import (
     TrackFrame,
 )
 from share.protocol.remote_tracking import TrackingCapacity
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 from share.startup import HeapTrimmer
 from share.timing import Backoff
@@ -107,6 +106,9 @@ def run_tracker(
 ) -> None:
     """Work of a `WorkerProcess`: answers TrackerReady, then takes frames and answers each with
     TrackerAnswered, until END."""
+    from share.runtime.fault_guard import FaultGuard
+    from share.runtime.guarded_tracker import GuardedTracker  # the edge itself tracks nobody
+
     guard = FaultGuard(lambda text: print(f"share: tracking {key}: {text}", file=sys.stderr, flush=True))
     tracker, heap = GuardedTracker(rig, settings, guard), HeapTrimmer()
     starts_new_odom = generation > 0  # an earlier tracker had another odom frame

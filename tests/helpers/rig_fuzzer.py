@@ -22,7 +22,8 @@ from helpers.plain_walk import RIG
 from share.config import Config
 from share.geometry import rig_check, se3
 from share.geometry.camera import Camera, Rig
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.pipeline import make_tracker
 from share.types import U8, Frame, ImuBatch
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -39,9 +40,12 @@ def way(start: float, steps: int) -> Iterator[np.ndarray]:
         yield se3.exp(xi) @ se3.inverse(T_BODY_CAM)
 
 
-def keyframes(place: Planes, start: float, seed: int, steps: int = 4) -> list[tuple[np.ndarray, Keyframe]]:
+@cache
+def keyframes(
+    place: Planes, start: float, seed: int, steps: int = 4
+) -> tuple[tuple[np.ndarray, Keyframe], ...]:
     """One run: true poses, and what it sends; its odom is anywhere."""
-    rng, found = np.random.default_rng(seed), []
+    rng, found = np.random.default_rng(seed), list[tuple[np.ndarray, Keyframe]]()
     T_odom_world = se3.exp(rng.normal(0, [0.1, 0.1, 0.1, 1, 1, 1]))
     for k, T in enumerate(way(start, steps)):
         image = textured_planes.image_view(place, T, rng, rho_sigma=0.005).source
@@ -49,7 +53,7 @@ def keyframes(place: Planes, start: float, seed: int, steps: int = 4) -> list[tu
         T_ref = se3.inverse(found[-1][1].T_odom_body) @ T_odom if k else T_odom
         sent = Keyframe(k, k - 1, k * 10**8, T_ref, COV, T_odom, UP, 0.0, View.empty(), k - 1, image)
         found.append((T, sent))
-    return found
+    return tuple(found)
 
 
 @pytest.fixture(scope="module")

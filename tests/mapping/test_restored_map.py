@@ -21,7 +21,7 @@ from share.store.map_store import MapStore
 from share.types import AgentKind, Keyframe
 
 ROOM = walls(1)
-STEPS = 36
+STEPS = 20
 
 
 class Session:
@@ -87,7 +87,7 @@ def restarted(session: Session, path: Path, config: Config) -> Session:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("most", [2000, 60])
+@pytest.mark.parametrize("most", [2000, 32])
 def test_a_restored_mapper_has_the_same_maps_and_continues(tmp_path: Path, most: int) -> None:
     config = Config()
     config = replace(config, edge=replace(config.edge, max_keyframes=most))

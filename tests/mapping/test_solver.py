@@ -172,9 +172,9 @@ def test_covariances_are_tight_upper_bounds() -> None:
 
 @pytest.mark.long
 def test_covariance_is_consistent() -> None:
-    """NEES of a late pose over 40 rooms: 6 on average if exact, less for an upper bound."""
+    """NEES of a late pose over 20 rooms: 6 on average if exact, less for an upper bound."""
     nees = []
-    for seed in range(40):
+    for seed in range(20):
         room = simulate(60, 2, 100 + seed)
         solution = loaded(room, _GAUSSIAN).solve(0, [58])
         xi = se3.log(se3.inverse(solution.poses[58]) @ room.truth[58])

@@ -40,8 +40,8 @@ def rejected(values: np.ndarray, each: int = 10, step: int = STEP) -> list[int]:
     return sorted(set(range(len(values))) - set(kept))
 
 
-@pytest.mark.parametrize("each", [1, 3, 10, 400])
-@pytest.mark.parametrize("length", [1, 2, 4, 6, 10, 30])
+@pytest.mark.parametrize("each", [1, 10, 400])
+@pytest.mark.parametrize("length", [1, 2, 6, 30])
 @pytest.mark.parametrize(("axis", "by"), [(0, 3.0), (2, -30.0), (3, 40.0), (5, -150.0)])
 def test_exactly_a_run_of_wrong_samples_is_rejected(axis: int, by: float, length: int, each: int) -> None:
     for at in (100, 107):
@@ -155,7 +155,7 @@ def begun(
     return out, breaks, samples
 
 
-@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("count", [1, 4])
 @pytest.mark.parametrize("gap_at", [None, 100])
 @pytest.mark.parametrize(("axis", "by"), [(0, 1.5), (1, -30.0), (3, 20.0), (4, 150.0), (5, -60.0)])
 def test_first_samples_that_contradict_the_next_are_rejected(

@@ -73,7 +73,7 @@ def finish(run: World) -> None:
 
 
 @given(seeds, networks)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @pytest.mark.long
 def test_over_a_bad_network_every_keyframe_is_applied_once_and_in_order(
     seed: int, network: dict[str, float]
@@ -127,7 +127,7 @@ def test_an_outage_that_overflows_the_ledger_leaves_a_consistent_chain(
     st.integers(1, 60),
     st.lists(st.tuples(st.integers(1, FRAMES - 1), st.booleans()), max_size=3),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @pytest.mark.long
 def test_restarted_edges_get_missing_keyframes(
     seed: int, network: dict[str, float], keep: int, kills: list[tuple[int, bool]]
@@ -182,7 +182,7 @@ def odometry(run: World) -> list[bytes]:
 
 
 @given(seeds, networks)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @pytest.mark.long
 def test_odometry_is_the_same_bits_with_and_without_an_edge(seed: int, network: dict[str, float]) -> None:
     walk = frames(seed)

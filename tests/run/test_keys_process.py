@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import json
-import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from helpers.children import SHARE, Child, start_agent
+from helpers.children import Child, start_agent
+from helpers.shell import Done
 
 FRAMES = 20  # of `plain_session`; agents play in real time
 
 
-def keys(folder: Path, *arguments: str) -> str:
-    command = [*SHARE, "keys", *arguments, "--keys", str(folder)]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+Share = Callable[..., Done]
+
+
+@pytest.fixture
+def keys(share: Share) -> Callable[..., str]:
+    """`share keys ARGUMENTS --keys FOLDER`: what it prints."""
+
+    def run(folder: Path, *arguments: str) -> str:
+        done = share("keys", *arguments, "--keys", folder)
+        assert done.code == 0, done.err
+        return done.out.strip()
+
+    return run
 
 
 @pytest.fixture
@@ -26,7 +36,7 @@ def recording(plain_session: Path) -> Path:
 class Server:
     """The machine of an edge; nobody is authorized at first."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, keys: Callable[..., str]) -> None:
         self.keys, self.out = folder / "server-keys", folder / "edge"
         self.public = keys(self.keys, "generate", "--name", "edge")
         where = ("--bind", "tcp://0.0.0.0:0", "--keys", str(self.keys), "--out", str(self.out))
@@ -39,15 +49,15 @@ class Server:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    server = Server(tmp_path)
+def server(tmp_path: Path, keys: Callable[..., str]) -> Iterator[Server]:
+    server = Server(tmp_path, keys)
     yield server
     server.edge.kill()
 
 
 @pytest.mark.long
 def test_only_an_agent_with_an_authorized_key_connects(
-    server: Server, recording: Path, tmp_path: Path
+    server: Server, recording: Path, tmp_path: Path, keys: Callable[..., str]
 ) -> None:
     public = keys(tmp_path / "ann-keys", "generate", "--name", "ann")
     keys(server.keys, "authorize", "ann", public)
@@ -87,8 +97,7 @@ def test_only_an_agent_with_an_authorized_key_connects(
         assert outcome["tracked"] == FRAMES  # odometry goes on alone
 
 
-@pytest.mark.long
-def test_one_line_each(tmp_path: Path) -> None:
+def test_one_line_each(tmp_path: Path, share: Share) -> None:
     for arguments, said in (
         (
             ("edge", "--bind", "tcp://0.0.0.0:0", "--keys", str(tmp_path)),
@@ -105,12 +114,12 @@ def test_one_line_each(tmp_path: Path) -> None:
         (("keys", "authorize", "ann", "nothing", "--keys", str(tmp_path)), "neither a file nor a public key"),
         (("keys", "revoke", "ann", "--keys", str(tmp_path)), "'ann' is not authorized; the list is empty"),
     ):
-        done = subprocess.run([*SHARE, *arguments], capture_output=True, text=True)
-        assert (done.returncode, done.stderr.count("\n"), done.stdout) == (2, 1, "")
-        assert said in done.stderr
+        done = share(*arguments)
+        assert (done.code, done.err.count("\n"), done.out) == (2, 1, "")
+        assert said in done.err
 
 
-def test_keys_by_command(tmp_path: Path) -> None:
+def test_keys_by_command(tmp_path: Path, keys: Callable[..., str]) -> None:
     own = keys(tmp_path, "generate", "--name", "edge")
     other = keys(tmp_path / "ann", "generate", "--name", "ann")
     keys(tmp_path, "authorize", "headset", str(tmp_path / "ann" / "ann.public"))

@@ -23,10 +23,11 @@ from share.odometry import filter
 from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.protocol import agent_events as ev
-from share.runtime import guarded_tracker
+from share.runtime import fault_guard, guarded_tracker
 from share.runtime.error_estimators import NoErrorEstimate
+from share.runtime.fault_guard import FaultGuard
 from share.runtime.frame_consumers import LocalTracking
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.guarded_tracker import GuardedTracker
 from share.types import TrackState
 from share.vision import corners
 
@@ -238,7 +239,7 @@ def test_two_threads_do_not_limit_lines_at_once(monkeypatch: pytest.MonkeyPatch)
             if not overlaps[-1]:
                 inside.release()
 
-    monkeypatch.setattr(guarded_tracker, "LineLimiter", Limiter)
+    monkeypatch.setattr(fault_guard, "LineLimiter", Limiter)
     guard = FaultGuard(lambda text: None)
     threads = [threading.Thread(target=guard.record, args=("a step", failure())) for _ in range(2)]
     for thread in threads:

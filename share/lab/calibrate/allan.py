@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -104,12 +105,18 @@ _NOISE_MODELS: tuple[Callable[[F64], F64], ...] = (
 
 
 def variance_covariance(sizes: I64, lengths: I64, rate_hz: float) -> F64:
-    """Return (3, 3, T, T): with squares p = (N^2, B^2, K^2) of an axis, sum_ab p_a p_b out[a, b] is the
-    covariance of its Allan variances at T sizes, over segments of `lengths` (S,) samples."""
-    out = np.zeros((3, 3, len(sizes), len(sizes)))
+    """Return (3, 3, T, T), read-only: with squares p = (N^2, B^2, K^2) of an axis, sum_ab p_a p_b out[a, b]
+    is the covariance of its Allan variances at T sizes, over segments of `lengths` (S,) samples."""
+    return _variance_covariance(tuple(sizes.tolist()), tuple(lengths.tolist()), rate_hz)
+
+
+@lru_cache(maxsize=2)  # a recording's gyroscope and accelerometer have the same
+def _variance_covariance(sizes: tuple[int, ...], lengths: tuple[int, ...], rate_hz: float) -> F64:
+    out, counts = np.zeros((3, 3, len(sizes), len(sizes))), np.array(lengths, np.int64)
     for i, m in enumerate(sizes):
         for j, n in enumerate(sizes[: i + 1]):
-            out[:, :, i, j] = out[:, :, j, i] = _pair_covariance(int(m), int(n), lengths, 1 / rate_hz)
+            out[:, :, i, j] = out[:, :, j, i] = _pair_covariance(m, n, counts, 1 / rate_hz)
+    out.setflags(write=False)
     return out
 
 

@@ -20,7 +20,8 @@ from share.geometry.camera import Camera
 from share.lab.peer_trackers import PeerTracker
 from share.lab.peer_trackers.peer_wire import PeerFrame, read_line, write_frame, write_line
 from share.recordings.trajectory import Trajectory
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.offline_tracking import track_frames
 from share.runtime.pipeline import check_trackable, read_frames
 from share.runtime.source import Source

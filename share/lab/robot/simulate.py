@@ -33,7 +33,8 @@ from share.robot.planar import PlanarPose
 from share.robot.robot_file import T_base_of_camera
 from share.robot.settings import RobotSettings
 from share.runtime.error_estimators import ErrorEstimator, NoErrorEstimate, SynchronousErrorModel
-from share.runtime.guarded_tracker import FaultGuard, GuardedTracker
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.guarded_tracker import GuardedTracker
 from share.runtime.offline_tracking import track_frames
 from share.sensors.profile import load_profile
 from share.types import AgentKind

@@ -28,9 +28,9 @@ def test_without_noise_the_estimate_is_exact(rng):
 
 
 def test_nees_is_consistent(rng):
-    """NEES over 60 draws: 6 for each if the covariance is right."""
+    """NEES over 30 draws: 6 for each if the covariance is right."""
     nees = []
-    for _ in range(60):
+    for _ in range(30):
         A, B = motions(rng, 100)
         found = hand_eye(noisy(A, rng, 0.003, 0.002), noisy(B, rng, 0.003, 0.002))
         error = se3.log(se3.inverse(found.T_a_b) @ X)

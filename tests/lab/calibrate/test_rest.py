@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from share.errors import DataError
-from share.lab.calibrate.imu import characterise, find_rest
+from share.lab.calibrate.imu import ImuCharacteristics, characterise, find_rest
 from share.lab.emulate.sensor.imu import measured_samples
 from share.sensors.profile import load_profile
 from share.types import ImuBatch
@@ -26,6 +26,12 @@ def handled(imu: ImuBatch, start_s: float, end_s: float) -> ImuBatch:
     by = np.where((t >= start_s) & (t < end_s), 1.0, 0.0)[:, None]
     sway = np.stack([np.sin(2 * np.pi * (0.4 + 0.1 * k) * t + k) for k in range(3)], axis=1)
     return ImuBatch(imu.stamps_ns, imu.gyro + 0.1 * by * sway, imu.accel + 0.3 * by * sway)
+
+
+@pytest.fixture(scope="module")
+def whole() -> ImuCharacteristics:
+    """Of ten minutes."""
+    return characterise(still(600))
 
 
 def seconds(part: slice) -> tuple[float, float]:
@@ -68,7 +74,7 @@ def test_rest_is_found_in_filtered_samples():
     assert find_rest(inner, RATE_HZ) == slice(0, len(inner))
 
 
-def test_lost_samples_are_counted_and_do_not_change_the_noise():
+def test_lost_samples_are_counted_and_do_not_change_the_noise(whole):
     """300 single samples and a gap of 2 s are lost."""
     imu = still(600)
     keep = np.ones(len(imu), bool)
@@ -77,18 +83,16 @@ def test_lost_samples_are_counted_and_do_not_change_the_noise():
     nature = characterise(imu.take(keep))
     assert nature.rate_hz == pytest.approx(RATE_HZ, rel=1e-4)
     assert nature.missing == np.count_nonzero(~keep[:-1]) and nature.unbridged_gaps == 1
-    whole = characterise(imu)
     assert nature.gyro.combined("density").value == pytest.approx(
         whole.gyro.combined("density").value, rel=0.01
     )
     assert nature.gyro.curve.segment_lengths.sum() == pytest.approx(len(imu) - 400, abs=5)
 
 
-def test_the_noise_of_the_profile_is_estimated():
-    nature = characterise(still(600))
-    assert nature.accel.combined("density").value == pytest.approx(IMU.accel.density, rel=0.03)
-    assert nature.accel.combined("walk").value == pytest.approx(IMU.accel.walk, rel=0.25)
-    assert nature.accel.mean == pytest.approx([0.1, 9.8, -0.3], abs=4 * IMU.accel.start_bias)
+def test_the_noise_of_the_profile_is_estimated(whole):
+    assert whole.accel.combined("density").value == pytest.approx(IMU.accel.density, rel=0.03)
+    assert whole.accel.combined("walk").value == pytest.approx(IMU.accel.walk, rel=0.25)
+    assert whole.accel.mean == pytest.approx([0.1, 9.8, -0.3], abs=4 * IMU.accel.start_bias)
 
 
 def test_too_few_or_too_slow_samples_are_refused():

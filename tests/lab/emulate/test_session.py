@@ -143,9 +143,9 @@ def test_one_worker_makes_the_same_bytes(whole, recipe, tmp_path):
 
 def test_another_seed_is_another_room_and_other_noise(whole, recipe, tmp_path):
     other = replace(recipe, seed=6)
-    a, b = (stage_of(r, tmp_path).actors[0] for r in (recipe, other))
-    boxes = [prepare_session(r, tmp_path, no_progress).layout.pieces[0].bounding_box for r in (recipe, other)]
-    assert not np.allclose(*boxes)
+    prepared = [prepare_session(r, tmp_path / str(r.seed), no_progress) for r in (recipe, other)]
+    assert not np.allclose(*(one.layout.pieces[0].bounding_box for one in prepared))
+    a, b = (one.stage.actors[0] for one in prepared)
     assert not np.allclose(a.path.poses(a.pictures.true_ns[:5]), b.path.poses(b.pictures.true_ns[:5]))
     assert (
         np.abs(a.device.imu_streams(a.path).gyro[:50] - b.device.imu_streams(a.path).gyro[:50]).max() > 1e-4

@@ -15,13 +15,13 @@ from share.robot.settings import DrivingArea
 
 pytestmark = pytest.mark.long
 
-GOAL = PlanarPose(4.0, 3.0, 0.5)
+GOAL, NEAR = PlanarPose(4.0, 3.0, 0.5), PlanarPose(3.2, 2.5, 0.5)
 SLOW = replace(usual_robot(), max_speed_m_s=0.15)
 
 
-def alone(kind: str, seconds: float = 3.0, goals: int = 1) -> Drive:
+def alone(kind: str, seconds: float = 3.0, goals: int = 1, goal: PlanarPose = GOAL) -> Drive:
     """A robot that drives in a map of its own when a fault comes."""
-    drive = Drive([GOAL] * goals, settings=SLOW, has_ann=False)
+    drive = Drive([goal] * goals, settings=SLOW, has_ann=False)
     drive.run_until(lambda: drive.speed_m_s > 0.1, 5.0)
     schedule_faults(drive.loop, [LoopFault(kind, 0.0, seconds)])
     return drive
@@ -46,7 +46,7 @@ def arrives(drive: Drive) -> None:
 
 
 def test_a_robot_arrives_where_a_wearer_points() -> None:
-    drive = Drive([PlanarPose(6.0, 4.0, 1.0)])
+    drive = Drive([GOAL])
     drive.run(60.0)
     [outcome] = drive.giver.outcomes
     assert outcome.is_reached and 0.05 < outcome.error_m <= REACHED_M and outcome.error_rad < 0.35
@@ -88,7 +88,7 @@ def test_an_edge_that_comes_back_without_its_map_stops_a_robot_in_a_shared_one()
 
 
 def test_three_seconds_without_network_do_not_stop_the_robot() -> None:
-    arrives(alone("network", seconds=3.0))
+    arrives(alone("network", seconds=3.0, goal=NEAR))
 
 
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_a_bridge_that_is_restarted_cancels_what_its_forerunner_left() -> None:
 
 
 def test_a_second_commander_is_refused_and_the_robot_goes_on() -> None:
-    drive = alone("rival")
+    drive = alone("rival", goal=NEAR)
     arrives(drive)
     assert any(text.startswith(f"{RIVAL}: refused: goal giver is sending the robot") for text in drive.texts)
 

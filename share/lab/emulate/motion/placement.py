@@ -26,6 +26,7 @@ _VOXEL_M = 0.1
 _YAWS = 24
 _SHIFT_M = 0.25
 _TIME_S = 0.1
+_SHIFT_CHUNK = 256  # shifts at a time
 _MAX_POINTS = 400  # of a path, for scoring
 _AMPLE_CLEARANCE_M = 0.8  # more clearance than this does not count
 _USUAL_HEIGHTS = {"person": 1.65, "robot": 0.35, "drone": 1.5}  # m, mean height of such a body's path
@@ -141,30 +142,33 @@ def _shift_scores(
 ) -> F64:
     """Return the score of each shift (S, 3); -inf where the path would touch the shell."""
     samples = p[:: max(1, len(p) // _MAX_POINTS)]
-    out = np.empty(len(shifts))
-    for i, shift in enumerate(shifts):
-        at = samples + shift
-        if _grid_values(shell.distance, at).min() < CLEARANCE_M:
-            out[i] = -np.inf
-            continue
+    out = np.full(len(shifts), -np.inf)
+    for first in range(0, len(shifts), _SHIFT_CHUNK):
+        at = samples + shifts[first : first + _SHIFT_CHUNK, None]
+        fits = _grid_values(shell.distance, at).min(axis=1) >= CLEARANCE_M
+        at = at[fits]
         room = _grid_values(whole.distance, _body_points(at, body_kind))
-        out[i] = (
-            -4 * (room < CLEARANCE_M).mean()
-            + room.clip(0, _AMPLE_CLEARANCE_M).mean()
-            - 0.3 * _grid_values(visited, at).mean()
+        out[first : first + _SHIFT_CHUNK][fits] = (
+            -4 * (room < CLEARANCE_M).mean(axis=1)
+            + room.clip(0, _AMPLE_CLEARANCE_M).mean(axis=1)
+            - 0.3 * _grid_values(visited, at).mean(axis=1)
         )
     return out
 
 
 def _body_points(xyz: F64, body_kind: str) -> F64:
-    """Return points of the whole body, not of the head alone, that must be free."""
-    lower = [np.column_stack([xyz[:, :2], np.full(len(xyz), z)]) for z in _BODY_HEIGHTS[body_kind]]
-    return np.concatenate([xyz, *lower])
+    """Return points (..., P, 3) of the whole body, not of the head (..., M, 3) alone, that must be free."""
+    lower = [
+        np.concatenate([xyz[..., :2], np.full_like(xyz[..., 2:], z)], axis=-1)
+        for z in _BODY_HEIGHTS[body_kind]
+    ]
+    return np.concatenate([xyz, *lower], axis=-2)
 
 
 def _grid_values(grid: F64 | F32, points: F64) -> F64:
+    """Return the grid's values (...) at points (..., 3) m."""
     cells = np.floor(points / _VOXEL_M).astype(int)
-    i, j, k = np.clip(cells, 0, np.array(grid.shape) - 1).T
+    i, j, k = np.moveaxis(np.clip(cells, 0, np.array(grid.shape) - 1), -1, 0)
     out: F64 = grid[i, j, k].astype(np.float64)
     return out
 

@@ -107,7 +107,7 @@ def _mark_surface(local: BoolArray, triangles: F64, step: float) -> None:
         same_count = behind[count == n]
         group = max(1, _POINT_CHUNK // len(weights))
         for k in range(0, len(same_count), group):
-            points = np.einsum("wk,fkd->fwd", weights, same_count[k : k + group]).reshape(-1, 3)
+            points = (weights @ same_count[k : k + group]).reshape(-1, 3)
             local[tuple(np.floor(points / step).astype(int).T)] = True
 
 

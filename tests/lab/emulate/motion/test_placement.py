@@ -30,11 +30,12 @@ def flight(reach=1.5, seconds=10.0, phase=0.0):
 @pytest.mark.long
 def test_a_flight_finds_room_around_it():
     layout = room((8.0, 5.0, 3.0), ((0, 0, 0), (3, 5, 2.9)))
-    found, (path,), notes = place_paths(layout, [PathToPlace("d", "drone", flight())], (1,))
+    guest = PathToPlace("d", "drone", flight())
+    found, (path,), notes = place_paths(layout, [guest], (1,))
     xyz = path.poses(every(path, 30))[:, :3, 3]
     assert Occupancy.from_layout(layout).clearance(xyz).min() > 0.25
     assert found.pieces == layout.pieces and not notes
-    again = place_paths(layout, [PathToPlace("d", "drone", flight())], (1,))[1][0]
+    again = place_paths(layout, [guest], (1,))[1][0]
     assert np.array_equal(again.poses(every(path, 3)), path.poses(every(path, 3)))
 
 

@@ -18,7 +18,7 @@ def boxes():
 
 def test_gray_level_is_albedo_times_light():
     room = plain(np.full((64, 64), 120, np.uint8))
-    for light in (25, 100, 240):
+    for light in (25, 240):
         lit = DrawableRoom(**vars(room) | {"light_map": np.full((4, 4), light, np.uint8)})
         for camera in (D435I, EUROC):
             image = GlRenderer(lit).radiance(camera, [SceneInstant(looking(0.3))])
@@ -73,7 +73,7 @@ def test_blur_through_a_lens(boxes):
 def test_a_pixel_is_the_mean_over_its_area(boxes):
     """The more samples, the nearer; three are nearly as good as many."""
     still = SceneInstant(looking(0.5))
-    reference = boxes.radiance(D435I, [still] * 128)
+    reference = boxes.radiance(D435I, [still] * 64)
     images = {n: boxes.radiance(D435I, [still] * n) for n in (1, 4, 16)}
     rms = {n: float(np.sqrt(np.mean((image - reference) ** 2))) for n, image in images.items()}
     print(rms)

@@ -46,8 +46,11 @@ def test_depth_is_that_of_a_camera_without_a_lens():
     rays = WIDE.directions(np.column_stack([x.ravel(), y.ravel()]).astype(float))
     px = np.rint(FISHEYE.project_wide(rays)).astype(int)
     assert np.median(np.abs(depth[px[:, 1], px[:, 0]] / flat - 1)) < 0.01  # to the nearest pixel
-    behind = FISHEYE.directions(np.stack(np.meshgrid(np.arange(512.0), np.arange(512.0)), -1))[..., 2] < 0
-    assert behind.any() and not depth[behind].any()
+    behind = (
+        FISHEYE.directions(np.stack(np.meshgrid(np.arange(0.0, 512, 4), np.arange(0.0, 512, 4)), -1))[..., 2]
+        < 0
+    )
+    assert behind.any() and not depth[::4, ::4][behind].any()
 
 
 def test_every_pixel_is_of_one_face():

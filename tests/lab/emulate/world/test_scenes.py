@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from functools import cache
 
 import numpy as np
@@ -18,9 +19,9 @@ pytestmark = pytest.mark.long
 
 CLEARANCE = 0.45  # m
 SMALL = (9.0, 6.0, 4.0)  # the paper's room
-SEEDS = range(4)
+SEEDS = range(3)
 few_and_more = pytest.mark.parametrize(
-    "seeds", [SEEDS, pytest.param(range(4, 8), marks=pytest.mark.slow)], ids=["few", "more"]
+    "seeds", [SEEDS, pytest.param(range(3, 8), marks=pytest.mark.slow)], ids=["few", "more"]
 )
 ROOMS = ("warehouse", "firestation", "corridor-twins", "whitewall")
 
@@ -38,9 +39,9 @@ def free_share(room: Layout) -> tuple[float, float]:
     return areas.max() / (room.size[0] * room.size[1]), areas.max() / areas.sum()
 
 
-def described(room: Layout) -> list[tuple[str, bytes, bytes, bytes]]:
+def described(room: Layout) -> list[tuple[Hashable, ...]]:
     return [
-        (p.name, p.shape.mesh.vertices.tobytes(), p.shape.mesh.uv.tobytes(), repr(p.shape.materials).encode())
+        (p.name, p.shape.mesh.vertices.tobytes(), p.shape.mesh.uv.tobytes(), p.shape.materials)
         for p in room.all_pieces
     ]
 
@@ -60,7 +61,7 @@ def test_everything_is_inside_the_room(name: str, seeds: range) -> None:
 
 @pytest.mark.parametrize("name", ROOMS)
 def test_the_same_seed_gives_the_same_room_and_another_seed_another(name: str) -> None:
-    assert described(make_scene_layout(name, 3)) == described(rooms(name)[3])
+    assert described(make_scene_layout(name, 2)) == described(rooms(name)[2])
     shapes = {tuple(described(room)) for room in rooms(name)}
     assert len(shapes) == len(SEEDS)
 
@@ -114,7 +115,7 @@ def test_nothing_floats(name: str, seeds: range) -> None:
 def test_most_of_the_floor_is_walkable_and_connected(
     name: str, size: tuple[float, float, float] | None, least: float
 ) -> None:
-    for seed in range(4):
+    for seed in SEEDS:
         share, connected = free_share(make_scene_layout(name, seed, size) if size else rooms(name)[seed])
         assert share >= least, seed
         assert connected > 0.97, seed
@@ -142,7 +143,7 @@ def test_a_large_warehouse_holds_more_things_not_larger_ones() -> None:
 @pytest.mark.parametrize("size", [None, (9.0, 6.0, 2.7), (30.0, 12.0, 3.5)])
 def test_the_two_corridors_look_alike(size: tuple[float, float, float] | None) -> None:
     """Every thing in the north corridor has its like in the south one, but for a few small ones."""
-    for seed in range(4):
+    for seed in SEEDS:
         room = make_scene_layout("corridor-twins", seed, size) if size else rooms("corridor-twins")[seed]
         north, south, T = hard_rooms.twin_corridors(room.size)
         there, here = (contents(room, area) for area in (north, south))

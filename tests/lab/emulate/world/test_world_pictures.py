@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,8 +13,14 @@ from share.lab.emulate.world.materials import MATERIAL_KINDS, Material
 from share.lab.emulate.world.noise import PICTURE_TEXELS, cloud
 from share.lab.emulate.world.prints import PRINTS
 from share.lab.emulate.world.surfaces import SURFACES
+from share.types import U8
 
 ALL = [Material(kind) for kind in MATERIAL_KINDS]
+
+
+@cache
+def drawn(material: Material) -> U8:
+    return draw_material(material, 5)
 
 
 def test_every_kind_has_one_recipe() -> None:
@@ -23,7 +30,7 @@ def test_every_kind_has_one_recipe() -> None:
 
 @pytest.mark.parametrize("material", ALL, ids=lambda m: m.kind)
 def test_same_seed_same_bytes_other_seed_or_variant_another_picture(material: Material) -> None:
-    first = draw_material(material, 5)
+    first = drawn(material)
     assert first.shape == (PICTURE_TEXELS, PICTURE_TEXELS) and first.dtype == np.uint8
     assert first.min() >= MIN_ALBEDO and first.max() <= MAX_ALBEDO
     assert zlib.crc32(first.tobytes()) == zlib.crc32(draw_material(material, 5).tobytes())
@@ -37,7 +44,7 @@ def test_same_seed_same_bytes_other_seed_or_variant_another_picture(material: Ma
 @pytest.mark.parametrize("material", [m for m in ALL if not m.is_fitted], ids=lambda m: m.kind)
 def test_surfaces_are_seamless(material: Material) -> None:
     """Steps over the border are no larger than the largest steps within the picture."""
-    picture = draw_material(material, 5).astype(float)
+    picture = drawn(material).astype(float)
     for image in (picture, picture.T):
         inside = np.abs(np.diff(image, axis=0)).mean(1)
         seam = np.abs(image[0] - image[-1]).mean()
