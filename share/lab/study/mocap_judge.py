@@ -276,7 +276,7 @@ def _goal_events(
         if since_s is not None and counts and not stood:
             yield {
                 "event": "stands",
-                "t_s": round(max(goal.call["t_s"], since_s + shift_s), 3),
+                "t_s": max(goal.call["t_s"], round(since_s + shift_s, 3)),
                 "goal": number,
                 "robot_m": _xy(sample),
                 "path_m": round(watch.path_m, 4),
