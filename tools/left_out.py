@@ -1,7 +1,7 @@
 """Replaces, in the frozen program, modules that our libraries import and SHARE never calls.
 
 SciPy's linear programming (HiGHS): every import of scipy.optimize loads its 7 MB and makes tables of its
-names.
+names. filterpy.stats: every import of filterpy.kalman would bring scipy.stats, 4 MB and half a second.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ KNOWN = {  # metadata has other words or none; remarks follow a semicolon
     "apsw": "Zlib; metadata says any-OSI; with SQLite (public domain)",
     "contourpy": "BSD-3-Clause",
     "cycler": "BSD-3-Clause",
+    "filterpy": "MIT",
     "flatbuffers": "Apache-2.0",
     "fonttools": "MIT",
     "kiwisolver": "BSD-3-Clause",

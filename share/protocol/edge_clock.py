@@ -75,6 +75,9 @@ class ClockFilter:
     """
 
     def __init__(self) -> None:
+        from filterpy import kalman  # takes a second to import: now, not at the first pong
+
+        self._kalman = kalman
         self.reset()
 
     def reset(self) -> None:
@@ -174,10 +177,7 @@ class ClockFilter:
                 self.steps += 1
                 self._initialise(offset_ns, at_ns, variance)
             return False
-        gain = P[:, 0] / (P[0, 0] + variance)
-        kept = np.eye(2) - np.outer(gain, [1.0, 0.0])
-        self._x = x + gain * (z - x[0])
-        self._P = kept @ P @ kept.T + variance * np.outer(gain, gain)  # Joseph's form: stays symmetric
+        self._x, self._P = self._kalman.update(x, P, z, np.array([[variance]]), np.array([[1.0, 0.0]]))
         self._consecutive_rejects = 0
         self._agreeing_exchanges += 1
         return True

@@ -99,7 +99,7 @@ def test_an_edge_listens_and_ends_when_asked(program):
 
 
 def test_the_whole_system_and_the_same_digits_as_from_source(share, tmp_path):
-    """Child processes, MCAP, poselib, SciPy and matplotlib all work frozen."""
+    """Child processes, MCAP, poselib, SciPy, filterpy and matplotlib all work frozen."""
     done = share("demo", "--seconds", 20, "--out", tmp_path / "demo")
     said = done.stdout
     assert "Warning" not in done.stderr
