@@ -47,7 +47,7 @@ def ransac_pose(
 
 
 def refine_absolute_pose(
-    T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float, iterations: int = 8
+    T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float
 ) -> PoseEstimate:
     """Refine T_cam_world by Gauss-Newton on reprojection errors with Cauchy weights.
 
@@ -55,7 +55,7 @@ def refine_absolute_pose(
     covariance is scaled up by the inliers' residuals, never down.
     """
     scale = focal / sigma_px
-    for _ in range(iterations):
+    for _ in range(_MAX_ITERATIONS):
         r, J = reprojection_residuals(T, points, uv, scale)
         weight = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
         H, g = _normal_equations(r, J, weight)
@@ -99,6 +99,7 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
 
 
 _BORDER_PX = 12.0  # of an image, in which no point is expected to be found
+_MAX_ITERATIONS = 8  # of a refinement
 MAX_KEYFRAMES = 60  # of the local map; a full one drops the keyframe closest to another
 
 

@@ -40,7 +40,6 @@ from share.types import AgentKind
 from share.wire.messages import Hello
 
 SHARE, TRUTH, WHEELS = "share", "truth", "wheels"
-LOCALISATIONS = (SHARE, TRUTH, WHEELS)
 LINK = "wifi5"
 ROBOT_RUN = 1000  # run id; those of the session's agents are 1, 2, …
 _FRAME_HZ = 15.0  # of a robot that knows its true place

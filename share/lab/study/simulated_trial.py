@@ -87,11 +87,11 @@ def carry_out(job: TrialJob) -> TrialDone:
 class SimulatedTrial:
     """A trial of participant number `index` with a policy, before or after its drive. planned: its way."""
 
-    def __init__(self, study: SimulatedStudy, index: int, policy: str, config: Config | None = None) -> None:
+    def __init__(self, study: SimulatedStudy, index: int, policy: str) -> None:
         self._study, self._index = study, index
         room, session, self.planned = _participant(study.folder, index)
         settings, name = study.settings, study.plan.participants[index].name
-        config = Config() if config is None else config
+        config = Config()
         config = replace(config, edge=replace(config.edge, policy=policy))
         seed, seconds = settings.seed * 1000 + index, self.planned.seconds + _TAIL_S
         rngs = [np.random.default_rng((seed, stream)) for stream in range(3)]
