@@ -51,8 +51,8 @@ from air_figures import Row, print_tables  # noqa: E402
 from keyframe_set import KeyframeSet  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from modelled_mapper import ModelledMapper, RecognitionModel  # noqa: E402
+from modelled_room import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
-from simulate import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.config import NEAR_M, Config, ControlConfig  # noqa: E402

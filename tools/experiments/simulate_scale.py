@@ -28,7 +28,7 @@ import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet, Spacing  # noqa: E402
 from measure_joins import configured  # noqa: E402
-from simulate import SIMULATED, Row, mean, play  # noqa: E402
+from modelled_room import SIMULATED, Row, mean, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
@@ -91,7 +91,7 @@ def _played(job: Job) -> list[Row]:
     (rooms, each), seed, policies, link, settings = job
     made, config = apart([_room(seed + 1000 * k, each) for k in range(rooms)]), configured(settings)
     return [
-        play(made, replace(config, edge=replace(config.edge, policy=policy)), link, seed, modelled=True)
+        play(made, replace(config, edge=replace(config.edge, policy=policy)), link, seed)
         for policy in policies
     ]
 
