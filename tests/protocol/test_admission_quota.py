@@ -54,7 +54,7 @@ def accepted(one: Keyframe, hello: m.Hello = HELLO) -> int:
 def test_an_agent_within_its_rate_is_never_refused(has_image: bool) -> None:
     """The whole ledger at once, and from then on twice control.rate_max_hz."""
     config = Config()
-    one = with_image(1) if has_image else keyframe(1, config.tracker.view_features)
+    one = with_image(1) if has_image else keyframe(1, 500)
     allowance, hz = KeyframeQuota(5.0), 2 * config.control.rate_max_hz
     assert not any(allowance.objection(HELLO, one, 0) for _ in range(config.agent.keep_keyframes))
     assert not any(allowance.objection(HELLO, one, round(k * S / hz)) for k in range(60 * int(hz)))
