@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.hellos import hello_of
 
-from share.config import Config
+from share.config import Config, with_policy
 from share.geometry.camera import Camera
 from share.mapping.query_queue import QueryQueue
 from share.mapping.recognition.patch_alignment import ORB_FEATURES
@@ -161,7 +161,7 @@ def test_an_extra_keyframe_is_skipped_at_once() -> None:
 
 @pytest.mark.parametrize(("policy", "some"), [("share", True), ("covins-g", False)])
 def test_the_edge_marks_keyframes_beyond_the_rate(policy: str, some: bool) -> None:
-    edge = EdgeProtocol(replace(Config(), edge=replace(Config().edge, policy=policy)), 8)
+    edge = EdgeProtocol(with_policy(Config(), policy), 8)
     edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
     effects = []
     for k in range(100):
