@@ -27,10 +27,9 @@ class TrackerConfig:
     """Tracking by cameras alone (`share.odometry.visual_tracker`); the views of any tracker."""
 
     corners: int = 250  # features tracked at once
-    view_features: int = 500  # ORB features of a keyframe, for relocalisation
 
     def __post_init__(self) -> None:
-        _require_positive(self, "corners", "view_features")
+        _require_positive(self, "corners")
 
 
 @dataclass(frozen=True)
@@ -84,10 +83,9 @@ class LinkConfig:
     """The link between agent and edge."""
 
     silent_s: float = 3.0  # no message for this long: the edge counts as gone
-    window: int = 16  # keyframes in flight
 
     def __post_init__(self) -> None:
-        _require_positive(self, "silent_s", "window")
+        _require_positive(self, "silent_s")
 
 
 @dataclass(frozen=True)

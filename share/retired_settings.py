@@ -10,6 +10,7 @@ from share.errors import ConfigError
 RETIRED_SETTINGS: dict[str, str] = {
     # tracker
     "tracker.spacing_px": "odometry.visual_tracker._SPACING_PX",
+    "tracker.view_features": "odometry.relocalisation.VIEW_FEATURES",
     "tracker.noise_px": "odometry.relocalisation.NOISE_PX",
     "tracker.ransac_px": "odometry.relocalisation.RANSAC_PX",
     "tracker.gate_sigma": "odometry.relocalisation.GATE_SIGMA",
@@ -130,6 +131,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "agent.blend_jump_m": "protocol.localisation.JUMP_M",
     "agent.blend_jump_rad": "protocol.localisation.JUMP_M",  # a rotation counts by its lever
     # link
+    "link.window": "protocol.agent_ledger.WINDOW",
     "link.hello_s": "protocol.edge_connection.HELLO_S",
     "link.refused_s": "protocol.edge_connection.REFUSED_S",
     "link.ping_s": "protocol.edge_clock.PING_S",

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.headset_reference import predict_pose
 
 from share.geometry.se3 import from_rt, inverse, matrix_from_quat, quat_from_matrix, so3_exp
-from share.headset.prediction import predict_pose
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"

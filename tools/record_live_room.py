@@ -30,14 +30,15 @@ from typing import Any
 from share import startup
 
 startup.prepare_process()
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from helpers.observed_simulation import observed_simulation  # noqa: E402
 from PIL import Image  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.lab.emulate.recipe import demo_recipe, meeting_seed  # noqa: E402
 from share.lab.emulate.session import make_cached_session  # noqa: E402
-from share.lab.evaluate.observed_simulation import observed_simulation  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.view.viewer import LiveRoom  # noqa: E402
 

@@ -50,10 +50,10 @@ from share.lab.evaluate.campaign import (  # noqa: E402
 )
 from share.lab.evaluate.provenance import describe_machine  # noqa: E402
 from share.lab.evaluate.real_time import RunOptions  # noqa: E402
-from share.lab.evaluate.report import format_number  # noqa: E402
 from share.lab.evaluate.run_metrics import RunMetrics  # noqa: E402
 from share.lab.evaluate.scoring import run_metrics  # noqa: E402
 from share.lab.evaluate.statistics import MEASURES, policy_names  # noqa: E402
+from share.lab.tables import format_number  # noqa: E402
 from share.recordings.session import read_session  # noqa: E402
 
 HISTORY = Path(__file__).resolve().parents[1] / "docs" / "lab" / "results" / "regression.jsonl"

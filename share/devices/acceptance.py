@@ -36,7 +36,6 @@ STEPS = (
     AcceptanceStep(BACK, 0.05, "leave it on the mark"),
     AcceptanceStep(WORK, 0.45, "use it freely: walk, look around, at near and far things"),
 )
-TEN_MINUTES_S = 600.0
 
 _ALLAN_S = 0.25  # at which white noise rules, and the interpolation of two streams is averaged out
 _STILL_RAD_S = 0.01  # a mean turn of the body over `_ALLAN_S` beyond this is motion

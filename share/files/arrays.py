@@ -38,10 +38,10 @@ def read_arrays(path: Path, objection: str, max_bytes: int = MAX_ARRAYS_BYTES) -
         raise DataError(f"{path}: {objection}, or damaged: {error!r:.200}") from None
 
 
-def read_array(path: Path, max_bytes: int = MAX_ARRAYS_BYTES) -> NDArray[Any]:
+def read_array(path: Path) -> NDArray[Any]:
     """Return the array of a .npy file. Raises DataError that names the file."""
     with read_errors(path):
-        data = read_bytes(path, max_bytes)
+        data = read_bytes(path, MAX_ARRAYS_BYTES)
     try:
         return _read_checked(io.BytesIO(data), len(data))
     except Exception as error:

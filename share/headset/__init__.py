@@ -1,2 +1,2 @@
-"""The page of the edge that headsets show: its server, who may use it, and where a headset's own space is in
-the map (extra headset; docs/do/headset.md)."""
+"""The page of the edge that headsets show: its server, its files, and who may use it (extra headset;
+docs/do/headset.md)."""

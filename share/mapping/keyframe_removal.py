@@ -112,13 +112,13 @@ def _move_loop(graph: MapGraph, old: Loop, edge: PoseEdge) -> Loop | None:
 
 
 def contract_pose(
-    pose: int, odometry: Sequence[PoseEdge], loops: Sequence[PoseEdge], share: float = _ODOMETRY_SHARE
+    pose: int, odometry: Sequence[PoseEdge], loops: Sequence[PoseEdge]
 ) -> tuple[list[PoseEdge], list[PoseEdge | None]]:
     """Return the edges that replace all `odometry` and `loops` edges at `pose`.
 
     Of odometry: all but the one along which the others moved, so none at the end of a chain. Of loops: one
-    for each, None where both ends would be the same pose. share: see `_ODOMETRY_SHARE`. Raises ValueError if
-    the pose has no odometry edge, or if an edge does not end at it.
+    for each, None where both ends would be the same pose. Raises ValueError if the pose has no odometry
+    edge, or if an edge does not end at it.
     """
     unrelated = [edge for edge in (*odometry, *loops) if pose not in (edge.a, edge.b)]
     if unrelated or not odometry:
@@ -129,8 +129,8 @@ def contract_pose(
     neighbour = path_edge.a if path_edge.b == pose else path_edge.b
     others = [edge for edge in odometry if edge is not path_edge and neighbour not in (edge.a, edge.b)]
     is_moving = [neighbour not in (edge.a, edge.b) for edge in loops]
-    to_odometry = (share if any(is_moving) else 1.0) / max(1, len(others))
-    to_loops = (1 - share if others else 1.0) / max(1, sum(is_moving))
+    to_odometry = (_ODOMETRY_SHARE if any(is_moving) else 1.0) / max(1, len(others))
+    to_loops = (1 - _ODOMETRY_SHARE if others else 1.0) / max(1, sum(is_moving))
     return [_move_end(edge, pose, neighbour, path_edge, to_odometry) for edge in others], [
         _move_end(edge, pose, neighbour, path_edge, to_loops) if moves else None
         for edge, moves in zip(loops, is_moving, strict=True)

@@ -28,6 +28,16 @@ def sigma_ahead(cov: F64) -> float:
     return float(np.hypot(se3.position_sigma(cov), AHEAD_M * se3.rotation_sigma(cov)))
 
 
+def body_motion(T_old: F64, T_new: F64, T_odom_body: F64) -> F64:
+    """Return the motion (6,) of the body from one T_map_odom to another, on the right."""
+    return se3.log(se3.inverse(T_old @ T_odom_body) @ T_new @ T_odom_body)
+
+
+def length_ahead(xi: F64) -> float:
+    """Return how far (m) a motion (6,) of the body moves it and what is 3 m ahead of it, at most."""
+    return float(np.linalg.norm(xi[3:]) + AHEAD_M * np.linalg.norm(xi[:3]))
+
+
 @dataclass(frozen=True, eq=False)
 class PlacementUncertainty:
     """Uncertainty of an agent's pose in a map.

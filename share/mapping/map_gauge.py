@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.localisation_gate import AHEAD_M
+from share.mapping.localisation_gate import AHEAD_M, body_motion, length_ahead
 from share.types import F64
 
 # How far from the solution an agent stays: its sigma, and at most so far, since two agents may be surer of
@@ -71,15 +71,10 @@ class MapGauge:
 
 def _led(place: SolvedPlace, before: F64, solved: F64) -> F64:
     """Return T_map_odom (4, 4) between two of them: where an agent was shown before, and where it is."""
-    way = se3.log(se3.inverse(before @ place.T_odom_body) @ solved @ place.T_odom_body)
+    way = body_motion(before, solved, place.T_odom_body)
     slack_m = min(place.sigma_m, _MAX_SLACK_M)
-    share = max(0.0, 1 - slack_m / max(_length_m(way), 1e-12))
+    share = max(0.0, 1 - slack_m / max(length_ahead(way), 1e-12))
     return se3.orthonormal(before @ place.T_odom_body @ se3.exp(share * way) @ se3.inverse(place.T_odom_body))
-
-
-def _length_m(way: F64) -> float:
-    """Return by how much a motion (6,) of a body moves the body and what is ahead of it, at most."""
-    return float(np.linalg.norm(way[3:]) + AHEAD_M * np.linalg.norm(way[:3]))
 
 
 def _gauge(places: list[SolvedPlace], published: list[F64]) -> F64:
@@ -92,7 +87,7 @@ def _gauge(places: list[SolvedPlace], published: list[F64]) -> F64:
     about = se3.from_rt(np.eye(3), solved_body[:, :3, 3].mean(axis=0))
     way = se3.log(se3.inverse(about) @ T @ about)
     most_m = min(place.sigma_m for place in places)
-    return about @ se3.exp(way * min(1.0, most_m / max(_length_m(way), 1e-12))) @ se3.inverse(about)
+    return about @ se3.exp(way * min(1.0, most_m / max(length_ahead(way), 1e-12))) @ se3.inverse(about)
 
 
 def _least_motion(poses: F64, goals: F64, weights: F64) -> F64:

@@ -21,8 +21,8 @@ _MIN_POSES = 10  # and they must span half the window
 class LocalError:
     """Local error of one agent. truth: poses of its body at stamps of its clock."""
 
-    def __init__(self, truth: Trajectory, window_s: float = WINDOW_S) -> None:
-        self._truth, self._window_ns = truth, round(window_s * 1e9)
+    def __init__(self, truth: Trajectory) -> None:
+        self._truth, self._window_ns = truth, round(WINDOW_S * 1e9)
         self._window: deque[tuple[int, F64, F64]] = deque()  # stamp ns, estimated position, true position
 
     def update(self, stamp_ns: int, T_odom_body: F64 | None, new_segment: bool = False) -> float | None:

@@ -16,6 +16,8 @@ from share.geometry.se3 import inverse, rotation_angle
 from share.metrics.ate import ErrorStatistics, error_statistics
 from share.types import F64, I64
 
+_MAX_STEP_NS, _DELTA_NS, _TOLERANCE_NS = 200_000_000, 1_000_000_000, 20_000_000
+
 
 @dataclass(frozen=True)
 class Rpe:
@@ -25,33 +27,27 @@ class Rpe:
     rotation: ErrorStatistics
 
 
-def rpe_frames(estimate: Trajectory, truth: Trajectory, max_step_ns: int = 200_000_000) -> Rpe:
-    """Return the RPE from each frame to the next. Steps longer than `max_step_ns` (lost, no truth) are left
-    out.
+def rpe_frames(estimate: Trajectory, truth: Trajectory) -> Rpe:
+    """Return the RPE from each frame to the next. Steps over 0.2 s (lost, no truth) are left out.
 
     Raises DataError if no pair is left.
     """
     stamps, T_est, T_truth = associate(estimate, truth)
-    i = np.flatnonzero(np.diff(stamps) <= max_step_ns)
+    i = np.flatnonzero(np.diff(stamps) <= _MAX_STEP_NS)
     return _rpe(T_est, T_truth, i, i + 1, "between frames")
 
 
-def rpe_time(
-    estimate: Trajectory,
-    truth: Trajectory,
-    delta_ns: int = 1_000_000_000,
-    tolerance_ns: int = 20_000_000,
-) -> Rpe:
-    """Return the RPE from each frame to the frame nearest to `delta_ns` later, within `tolerance_ns`.
+def rpe_time(estimate: Trajectory, truth: Trajectory) -> Rpe:
+    """Return the RPE from each frame to the frame nearest to 1 s later, within 20 ms.
 
     Raises DataError if no pair is left.
     """
     stamps, T_est, T_truth = associate(estimate, truth)
     if len(stamps) == 0:
         raise DataError("RPE: no estimated pose has a truth at its time")
-    j = _nearest(stamps, stamps + delta_ns)
-    i = np.flatnonzero(np.abs(stamps[j] - stamps - delta_ns) <= tolerance_ns)
-    return _rpe(T_est, T_truth, i, j[i], f"over {delta_ns / 1e9:g} s")
+    j = _nearest(stamps, stamps + _DELTA_NS)
+    i = np.flatnonzero(np.abs(stamps[j] - stamps - _DELTA_NS) <= _TOLERANCE_NS)
+    return _rpe(T_est, T_truth, i, j[i], "over 1 s")
 
 
 def _nearest(stamps: I64, queries_ns: I64) -> I64:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from share.config import InertialConfig, TrackerConfig
+from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import ImuBias, Rig
 from share.odometry import filter, initialisation, relocalisation, visual_update
@@ -62,7 +62,6 @@ class InertialTracker:
         self,
         rig: Rig,
         config: InertialConfig,
-        tracker_config: TrackerConfig,
         bias: ImuBias | None = None,
     ) -> None:
         """bias: of the IMU, as estimated by an earlier run. Raises ValueError without an IMU."""
@@ -87,7 +86,6 @@ class InertialTracker:
         self._realignment = TiltRealignment()
         self._start_cov: F64 | None = None  # of the pose in odom where the filter began; None: exact
         self._local_map = LocalMap()  # for relocalisation
-        self._tracker_config = tracker_config
         self._round_robin = relocalisation.RoundRobin()
         self._lost_ns: int | None = None
 
@@ -218,8 +216,7 @@ class InertialTracker:
             return None
         batch = self._round_robin.next_batch(sorted(self._local_map.keyframes, reverse=True))
         keyframes = [self._local_map.keyframes[n] for n in batch]
-        view_features = self._tracker_config.view_features
-        return relocalisation.relocalise(keyframes, frame, self._rig, view_features)
+        return relocalisation.relocalise(keyframes, frame, self._rig)
 
     def _awaits_relocalisation(self, stamp_ns: int) -> bool:
         """Return whether the loss is so recent that no new segment begins yet."""

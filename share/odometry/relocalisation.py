@@ -47,7 +47,7 @@ def ransac_pose(
 
 
 def refine_absolute_pose(
-    T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float, iterations: int = 8
+    T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float
 ) -> PoseEstimate:
     """Refine T_cam_world by Gauss-Newton on reprojection errors with Cauchy weights.
 
@@ -55,7 +55,7 @@ def refine_absolute_pose(
     covariance is scaled up by the inliers' residuals, never down.
     """
     scale = focal / sigma_px
-    for _ in range(iterations):
+    for _ in range(_MAX_ITERATIONS):
         r, J = reprojection_residuals(T, points, uv, scale)
         weight = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
         H, g = _normal_equations(r, J, weight)
@@ -99,6 +99,7 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
 
 
 _BORDER_PX = 12.0  # of an image, in which no point is expected to be found
+_MAX_ITERATIONS = 8  # of a refinement
 MAX_KEYFRAMES = 60  # of the local map; a full one drops the keyframe closest to another
 
 
@@ -112,10 +113,10 @@ class LocalKeyframe:
     surfaces: KeyframeImage | None = None
     _view: View | None = None
 
-    def view(self, camera: Camera, count: int) -> View:
+    def view(self, camera: Camera) -> View:
         """Return its ORB view; made when first needed, since an agent is seldom LOST."""
         if self._view is None and self.surfaces is not None:
-            self._view = image_view(self.image, camera, self.surfaces, count)
+            self._view = image_view(self.image, camera, self.surfaces, VIEW_FEATURES)
         return View.empty() if self._view is None else self._view
 
 
@@ -203,6 +204,7 @@ class LocalMap:
 
 # Relocalisation in the keyframes of the local map.
 
+VIEW_FEATURES = 500  # ORB features of a frame or keyframe
 MAX_HAMMING_BITS = 64  # of 256
 _BATCH_SIZE = 8  # keyframes that a LOST frame is matched with
 MATCH_RATIO = 0.8  # of the best distance to the second best (Lowe 2004)
@@ -226,15 +228,15 @@ class RoundRobin:
         return numbers[first : first + self._batch_size]
 
 
-def relocalise(keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, view_features: int) -> F64 | None:
+def relocalise(keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig) -> F64 | None:
     """Return T_odom_cam (4, 4) of the frame by its ORB features and the keyframe with the most inliers; None
     without enough.
 
     It takes twice as many inliers as tracking, because nothing else confirms the pose.
     """
-    px, descriptors = detect_orb(frame.image0, view_features, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG))
+    px, descriptors = detect_orb(frame.image0, VIEW_FEATURES, mask=field_mask(rig.cam0, UNIFORM_FIELD_DEG))
     uv = rig.cam0.normalise(px.astype(np.float64))
-    views = [keyframe.view(rig.cam0, view_features) for keyframe in keyframes]
+    views = [keyframe.view(rig.cam0) for keyframe in keyframes]
     estimates = [
         _match_view(view, keyframe.T_odom_cam, uv, descriptors, rig.cam0.focal)
         for view, keyframe in zip(views, keyframes, strict=True)

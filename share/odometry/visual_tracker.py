@@ -334,8 +334,8 @@ class VisualTracker:
     def _relocalise(self, frame: Frame) -> TrackResult:
         """Relocalise in the local map; after NEW_SEGMENT_S, begin a new segment at the last pose."""
         assert self._lost_since_ns is not None
-        config, keyframes = self._config, self._next_keyframes()
-        T_found = relocalisation.relocalise(keyframes, frame, self._rig, config.view_features)
+        keyframes = self._next_keyframes()
+        T_found = relocalisation.relocalise(keyframes, frame, self._rig)
         waited_s = (frame.stamp_ns - self._lost_since_ns) * 1e-9
         if T_found is not None:
             self._T_odom_cam, self._tracks = T_found, _NO_TRACKS

@@ -58,7 +58,7 @@ class AgentProtocol:
     def __init__(self, hello: m.Hello, config: Config) -> None:
         self._config = config
         self._keyframe_chain, self._pace = KeyframeChain(), KeyframePace()
-        self._ledger = KeyframeLedger(config.agent.keep_keyframes, config.link.window)
+        self._ledger = KeyframeLedger(config.agent.keep_keyframes)
         self._localisation = MapLocalisation(config.agent.blend_s)
         self._self_evaluation = SelfEvaluation()
         self._evaluation_timer = PeriodicTimer(EVALUATION_S)

@@ -14,6 +14,7 @@ from share.timing import seconds_to_ns
 from share.types import F64, Keyframe, OdometryKeyframe
 from share.wire.messages import Ack, Welcome
 
+WINDOW = 16  # keyframes in flight
 RESEND_S = 1.0  # first wait for an acknowledgement, at least; doubles with each resend
 RESEND_MAX_S = 8.0  # longest wait
 GAP_RESEND_S = 0.1  # first wait for a keyframe that later ones have overtaken
@@ -47,7 +48,7 @@ class KeyframeLedger:
     `counts` has both, by name.
     """
 
-    def __init__(self, capacity: int, window: int) -> None:
+    def __init__(self, capacity: int, window: int = WINDOW) -> None:
         self.counts: Counter[str] = Counter()
         self._capacity, self._window = capacity, window
         self._acknowledged: dict[int, LedgerEntry] = {}

@@ -9,7 +9,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.se3 import compose_cov, inverse, position_sigma, rotation_sigma
-from share.mapping.localisation_gate import AHEAD_M
+from share.mapping.localisation_gate import body_motion, length_ahead
 from share.metrics.local_error import WINDOW_S
 from share.protocol import agent_events as ev
 from share.protocol.agent_ledger import LedgerEntry
@@ -50,8 +50,8 @@ class MapFrame:
         elapsed_s, self._advanced_ns = max(0, now_ns - self._advanced_ns) / SECOND_NS, now_ns
         if self._current is None or self._target is None or self._current is self._target:
             return None
-        xi = _body_motion(self._current, self._target, T_odom_body)
-        length_m = _length_m(xi)
+        xi = body_motion(self._current, self._target, T_odom_body)
+        length_m = length_ahead(xi)
         if length_m <= _ARRIVED_M:
             self._current = self._target
             return None
@@ -86,7 +86,7 @@ class MapFrame:
         """Set a new target. Return whether the pose jumps to it."""
         target, is_same_map = correction.T_map_odom, correction.map_id == self.map_id
         motion_m = (
-            0.0 if self._current is None else _length_m(_body_motion(self._current, target, T_odom_body))
+            0.0 if self._current is None else length_ahead(body_motion(self._current, target, T_odom_body))
         )
         jumps = self._current is None or not is_same_map or motion_m > JUMP_M
         self._target, self._cov, self.map_id = target, correction.cov, correction.map_id
@@ -101,16 +101,6 @@ class MapFrame:
     def reset(self) -> None:
         """Forget the transform: odometry broke."""
         self._target = self._current = self._unsettled_since_ns = None
-
-
-def _body_motion(T_old: F64, T_new: F64, T_odom_body: F64) -> F64:
-    """Return the motion (6,) of the body from one T_map_odom to another, on the right."""
-    return se3.log(inverse(T_old @ T_odom_body) @ T_new @ T_odom_body)
-
-
-def _length_m(xi: F64) -> float:
-    """Return how far a motion (6,) of the body moves the body and what is ahead of it, at most."""
-    return float(np.linalg.norm(xi[3:]) + AHEAD_M * np.linalg.norm(xi[:3]))
 
 
 _MAX_SETTLED = 1000

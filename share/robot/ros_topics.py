@@ -20,6 +20,7 @@ from cyclonedds.util import duration
 from share.errors import TransportError
 
 _MAX_FOUND = 1000
+_MAX_TAKEN = 64
 _BLOCK = duration(milliseconds=0)  # a full writer drops
 
 
@@ -85,11 +86,11 @@ class RosTopics:
         del self._participant, self._domain
 
 
-def taken(reader: Any, kind: type, count: int = 64) -> list[Any]:
-    """Return the messages that have come, at most `count`. What cannot be decoded is left out, with what
+def taken(reader: Any, kind: type) -> list[Any]:
+    """Return the messages that have come, at most 64. What cannot be decoded is left out, with what
     came in the same moment: anybody on the domain can write."""
     try:
-        return [message for message in reader.take(count) if isinstance(message, kind)]
+        return [message for message in reader.take(_MAX_TAKEN) if isinstance(message, kind)]
     except Exception:  # of many types: struct, Unicode, recursion, DDS
         return []
 

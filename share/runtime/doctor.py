@@ -181,7 +181,7 @@ def _bytes_per_s(sensor: Profile | None) -> float:
     return 2.0 * sensor.mode.width * sensor.mode.height * sensor.rate_hz
 
 
-def probe_edge(address: str, keys: AgentKeys | None, timeout_s: float = _EDGE_TIMEOUT_S) -> CheckResult:
+def probe_edge(address: str, keys: AgentKeys | None) -> CheckResult:
     """Check that an edge answers at `address`, accepts `keys` and speaks our version; measure its round trip.
 
     Uses pings, which an edge answers without a hello: no agent is created. Raises UsageError for a malformed
@@ -189,7 +189,7 @@ def probe_edge(address: str, keys: AgentKeys | None, timeout_s: float = _EDGE_TI
     """
     with closing(connect(address, secrets.randbits(63), keys)) as link:
         try:
-            round_trip_s = _measure_round_trip(link, time.monotonic() + timeout_s)
+            round_trip_s = _measure_round_trip(link, time.monotonic() + _EDGE_TIMEOUT_S)
         except WireError as error:
             return fail("edge", f"{address}: {error}", "install one version of SHARE on both machines")
         trouble = link.trouble()
@@ -198,7 +198,7 @@ def probe_edge(address: str, keys: AgentKeys | None, timeout_s: float = _EDGE_TI
     if trouble is not None:
         return fail("edge", f"{address}: {trouble}")
     fix = f"start it there: share edge --bind {address}, and check that the port is open"
-    return fail("edge", f"{address}: no answer within {timeout_s:g} s", fix)
+    return fail("edge", f"{address}: no answer within {_EDGE_TIMEOUT_S:g} s", fix)
 
 
 def _measure_round_trip(link: AgentLink, deadline_s: float) -> float | None:

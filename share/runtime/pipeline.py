@@ -164,5 +164,5 @@ def check_trackable(name: str, rig: Rig) -> None:
 def make_tracker(rig: Rig, config: Config, bias: ImuBias | None = None) -> VisualTracker | InertialTracker:
     """Return a tracker for `rig`. bias: initial IMU bias, None if unknown. Raises ValueError if none fits."""
     if rig.imu is not None:
-        return InertialTracker(rig, config.inertial, config.tracker, bias=bias)
+        return InertialTracker(rig, config.inertial, bias=bias)
     return VisualTracker(rig, config.tracker)

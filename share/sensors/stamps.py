@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from share.sensors.measurement import Measurement
+from share.types import I64
 
 WRAP_NS = 2**32 * 1000  # 4294.967296 s
 MAX_JUMP_S = 10.0  # a longer step is accepted after three consistent samples; a backward one never
@@ -12,6 +15,14 @@ GAP_FACTOR = 2.5  # a step longer than this many frame intervals is a gap of the
 MAX_JUMP_NS = int(MAX_JUMP_S * 1e9)
 _MIN_AGREEING = 3  # measurements that must agree before a jump is accepted
 _MAX_CONTRADICTING = 100  # measurements from before a jump, after which the jump is taken for stray stamps
+
+
+def unwrap_stamps(stamps_ns: I64, period_ns: int = WRAP_NS) -> I64:
+    """Return ordered stamps (N,) of one stream without the wraps of its counter; period_ns 0: it has none."""
+    if not period_ns:
+        return stamps_ns
+    wraps = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[:1]) < -period_ns // 2)
+    return np.asarray(stamps_ns + period_ns * wraps, np.int64)
 
 
 class StampRepair:

@@ -20,6 +20,7 @@ _BORDER_PX = 6
 _BANDS = 4
 _BAND_MARGIN_PX = 8  # rows beyond a band on which its corners depend
 _FAST_CONTRAST = 12
+_STRONGEST_QUALITY = 0.005  # of the best corner
 GRID = (8, 6)  # cells across and down, over which features are spread
 
 
@@ -55,10 +56,8 @@ def _masked(px: I64, strength: F32, mask: U8) -> tuple[I64, F32]:
     return px[allowed], strength[allowed]
 
 
-def strongest(
-    image: U8, occupied_px: F32, count: int, spacing: float, quality: float = 0.005, mask: U8 | None = None
-) -> F32:
-    """Return corners as `detect` does, but not spread: those down to `quality` times the best.
+def strongest(image: U8, occupied_px: F32, count: int, spacing: float, mask: U8 | None = None) -> F32:
+    """Return corners as `detect` does, but not spread: those down to `_STRONGEST_QUALITY` times the best.
 
     Without an IMU a few good corners are better than many (0.5 cm less in the kitchen of
     docs/understand/odometry-without-imu.md).
@@ -68,7 +67,7 @@ def strongest(
     free = _free_mask(occupied_px, spacing, image.shape)
     if mask is not None:
         free &= mask
-    found = cv2.goodFeaturesToTrack(image, count, quality, spacing, mask=free, blockSize=_BLOCK_PX)
+    found = cv2.goodFeaturesToTrack(image, count, _STRONGEST_QUALITY, spacing, mask=free, blockSize=_BLOCK_PX)
     return np.zeros((0, 2), np.float32) if found is None else _refined(image, found)
 
 

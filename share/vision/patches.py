@@ -23,6 +23,7 @@ _AXIS = np.arange(-HALF_SIZE, HALF_SIZE + 1, dtype=np.float32)
 OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)  # (S, 2) px, x and y
 _MEAN: F32 = np.full(_SIDE**2, 1 / _SIDE**2, np.float32)
 _MIN_CONTRAST = 1e-3  # norm of gray levels, below which a patch has no texture
+_CONVERGED_PX = 0.02  # a step below this ends an alignment
 _MAX_REMAP_ROWS = 30_000  # of the output of cv2.remap (SHRT_MAX)
 
 
@@ -128,7 +129,6 @@ def align(
     px: F64,
     warp: F64,
     max_steps: int = 4,
-    convergence_px: float = 0.02,
 ) -> AlignedPatches:
     """Align patches with kernels (N, 3, S) from px (N, 2), warped by (N, 2, 2): d px here / d px in the
     patch.
@@ -159,7 +159,7 @@ def align(
         at[active] -= move
         step_px = np.hypot(move[:, 0], move[:, 1])
         last_step[active] = step_px
-        active = active[(step_px > convergence_px) & np.isfinite(step_px)]
+        active = active[(step_px > _CONVERGED_PX) & np.isfinite(step_px)]
     return AlignedPatches(at, correlation, last_step, samples)
 
 

@@ -1,10 +1,11 @@
-"""Memory that this process may still take."""
+"""Memory and disk space that this process may still take."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
-from share.devices.host import free_memory_bytes
+from share.devices.host import free_disk_bytes, free_memory_bytes
 
 GB = 1_000_000_000
 
@@ -48,3 +49,8 @@ def test_free_memory_may_be_unknown(tmp_path):
 
 def test_free_memory_of_this_machine():
     assert free_memory_bytes() > 10_000_000
+
+
+def test_free_disk_space_is_that_of_the_nearest_folder(tmp_path: Path) -> None:
+    existing, free = free_disk_bytes(tmp_path / "not" / "yet")
+    assert existing == tmp_path and free == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.2)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.headset_reference import PairOutcome, PosePair, SpaceAlignment
 from helpers.headset_wearer import HZ, T_body_viewer, wearer
 
 from share.geometry import se3
-from share.headset.alignment import PairOutcome, PosePair, SpaceAlignment
 
 
 def aligned(

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from helpers import emulated_wearer as worn
 from helpers.browser import BrowserPage
+from helpers.headset_reference import PosePair, SpaceAlignment, pose_cov, predict_pose
 from helpers.headset_wearer import T_body_viewer, wearer
 
 from share.geometry import se3
-from share.headset.alignment import PosePair, SpaceAlignment, pose_cov
-from share.headset.prediction import predict_pose
 from share.types import F64
 
 pytestmark = pytest.mark.long

@@ -4,9 +4,9 @@ that both drift, as a headset's alignment takes them."""
 from __future__ import annotations
 
 import numpy as np
+from helpers.headset_reference import PosePair
 
 from share.geometry import se3
-from share.headset.alignment import PosePair
 from share.types import F64
 
 T_body_viewer = se3.exp(np.array([1.2, -0.3, 0.5, 0.02, -0.08, 0.05]))

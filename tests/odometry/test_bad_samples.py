@@ -30,7 +30,7 @@ def clean(walk: tuple[Frame, ...]) -> list[TrackResult]:
 
 
 def tracked(frames: tuple[Frame, ...]) -> tuple[list[TrackResult], InertialTracker]:
-    tracker, results = InertialTracker(RIG, Config().inertial, Config().tracker), []
+    tracker, results = InertialTracker(RIG, Config().inertial), []
     for frame in frames:
         results.append(tracker.track(frame))
         if results[-1].keyframe_ready:

@@ -26,7 +26,7 @@ def walk(request, plain_session):
     source = open_source(f"{plain_session}/ar1")
     rig = source.rig
     tracker = (
-        InertialTracker(rig, InertialConfig(), TrackerConfig())
+        InertialTracker(rig, InertialConfig())
         if request.param == "inertial"
         else VisualTracker(rig, TrackerConfig())
     )

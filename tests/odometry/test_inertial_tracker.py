@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from share.config import Config, InertialConfig, TrackerConfig
+from share.config import Config, InertialConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
@@ -49,7 +49,7 @@ def tracked(walk):
 
 def run(walk, frames, config=None):
     tracker, results, candidates = (
-        InertialTracker(walk[1], config or InertialConfig(), TrackerConfig()),
+        InertialTracker(walk[1], config or InertialConfig()),
         [],
         [],
     )
@@ -111,7 +111,7 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
     """The first keyframes come while the tilt is a degree off; its correction is no rotation, neither between
     them nor in the poses that are published."""
     frames, rig, truth = walk
-    tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
+    tracker, shown = InertialTracker(rig, InertialConfig()), []
     for frame in frames:
         if tracker.track(frame).keyframe_ready:
             shown.append((frame.stamp_ns, tracker.make_keyframe(frame)))
@@ -130,7 +130,7 @@ def test_keyframes_carry_the_motion_by_the_present_state(walk):
 def test_keyframes_carry_their_pose_relative_to_earlier_ones_by_the_present_state(walk):
     """Those published, as long as the state has them."""
     frames, rig, _ = walk
-    tracker, published, known = InertialTracker(rig, InertialConfig(), TrackerConfig()), {}, 0
+    tracker, published, known = InertialTracker(rig, InertialConfig()), {}, 0
     for frame in frames:
         if not tracker.track(frame).keyframe_ready:
             continue
@@ -167,7 +167,7 @@ def test_the_tracker_tells_the_ledger_the_pose_relative_to_the_reference(tracked
 
 def test_after_a_loss_keyframes_are_relative_to_none_before_it(walk):
     frames, rig, _ = walk
-    tracker, before = InertialTracker(rig, InertialConfig(), TrackerConfig()), set()
+    tracker, before = InertialTracker(rig, InertialConfig()), set()
     for frame in frames[: len(frames) // 2]:
         if tracker.track(frame).keyframe_ready:
             tracker.make_keyframe(frame)
@@ -192,7 +192,7 @@ def test_keyframe_work_is_sliced_and_poses_do_not_depend_on_when_it_runs(walk, t
     """A keyframe is published with its own frame; its features come a frame later. Whether anybody calls
     `finish_keyframe`, or the next frame does it."""
     frames, rig, _ = walk
-    tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
+    tracker, poses, shown = InertialTracker(rig, InertialConfig()), [], {}
     begun, hosts = {}, []  # when each keyframe came; which have features after each frame
     for k, frame in enumerate(frames):
         result = tracker.track(frame)
@@ -221,7 +221,7 @@ def test_keyframe_work_is_sliced_and_poses_do_not_depend_on_when_it_runs(walk, t
 @pytest.mark.parametrize("every", [2, 3])  # of 15 Hz
 def test_at_low_frame_rates_a_keyframe_has_its_features_before_the_next_frame(walk, every):
     frames, rig, _ = walk
-    tracker, published, samples = InertialTracker(rig, InertialConfig(), TrackerConfig()), 0, ImuBatch.empty()
+    tracker, published, samples = InertialTracker(rig, InertialConfig()), 0, ImuBatch.empty()
     for k, frame in enumerate(frames):
         samples = samples.concatenate(frame.imu)
         if k % every:
@@ -239,7 +239,7 @@ def test_at_low_frame_rates_a_keyframe_has_its_features_before_the_next_frame(wa
 def test_a_keyframe_is_its_image_and_surfaces(walk, tracked):
     """The image of its own frame, compressed, and surfaces whose depth is that of the pair of images."""
     frames, rig, _ = walk
-    tracker, off = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
+    tracker, off = InertialTracker(rig, InertialConfig()), []
     for frame in frames:
         if not tracker.track(frame).keyframe_ready:
             continue
@@ -386,7 +386,7 @@ def test_predicted_poses_between_frames(walk):
         assert np.linalg.norm(off[:3]) < far_rad
         assert np.linalg.norm(off[3:]) < far_m
     assert (state == tracker.state.T).all()
-    assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
+    assert InertialTracker(walk[1], InertialConfig()).predict(to) is None
 
 
 def test_a_wrong_extrinsic_is_reported_and_can_be_estimated(walk, tracked, monkeypatch):
@@ -408,7 +408,7 @@ def test_a_rig_without_imu_is_refused():
     camera = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
     stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=se3.from_rt(np.eye(3), np.array([-0.05, 0, 0])))
     with pytest.raises(ValueError, match="IMU"):
-        InertialTracker(stereo, InertialConfig(), TrackerConfig())
+        InertialTracker(stereo, InertialConfig())
 
 
 def test_a_recording_whose_clock_begins_at_zero(walk):
@@ -422,7 +422,7 @@ def test_a_recording_whose_clock_begins_at_zero(walk):
         )
         for frame in frames[:2]
     )
-    tracker = InertialTracker(rig, InertialConfig(), TrackerConfig())
+    tracker = InertialTracker(rig, InertialConfig())
     tracker.track(first)
     assert tracker.track(second).state is not TrackState.LOST
     assert tracker.state is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.hellos import hello_of
 
-from share.config import Config
+from share.config import Config, with_policy
 from share.geometry.camera import Camera
 from share.mapping.query_queue import QueryQueue
 from share.mapping.recognition.patch_alignment import ORB_FEATURES
@@ -54,7 +54,7 @@ def accepted(one: Keyframe, hello: m.Hello = HELLO) -> int:
 def test_an_agent_within_its_rate_is_never_refused(has_image: bool) -> None:
     """The whole ledger at once, and from then on twice control.rate_max_hz."""
     config = Config()
-    one = with_image(1) if has_image else keyframe(1, config.tracker.view_features)
+    one = with_image(1) if has_image else keyframe(1, 500)
     allowance, hz = KeyframeQuota(5.0), 2 * config.control.rate_max_hz
     assert not any(allowance.objection(HELLO, one, 0) for _ in range(config.agent.keep_keyframes))
     assert not any(allowance.objection(HELLO, one, round(k * S / hz)) for k in range(60 * int(hz)))
@@ -161,7 +161,7 @@ def test_an_extra_keyframe_is_skipped_at_once() -> None:
 
 @pytest.mark.parametrize(("policy", "some"), [("share", True), ("covins-g", False)])
 def test_the_edge_marks_keyframes_beyond_the_rate(policy: str, some: bool) -> None:
-    edge = EdgeProtocol(replace(Config(), edge=replace(Config().edge, policy=policy)), 8)
+    edge = EdgeProtocol(with_policy(Config(), policy), 8)
     edge.handle(PeerMessageReceived(m.peer_id(1), encode(hello_of("eve", 1))), 0)
     effects = []
     for k in range(100):

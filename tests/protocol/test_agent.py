@@ -16,6 +16,7 @@ from share.errors import UsageError
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.agent import AgentProtocol
+from share.protocol.agent_ledger import WINDOW
 from share.protocol.common_events import Connected, EdgeMessageReceived, FailRun, PrintLine, SendToEdge
 from share.types import Correction, Keyframe, KeyframeImage, OdometryKeyframe, TrackState, View
 from share.vision.keyframe_images import compress
@@ -326,7 +327,7 @@ def test_keyframes_made_offline_are_sent_after_the_welcome() -> None:
         effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
         assert not only(Keyframe, effects, messages=True)
     effects = tell(agent, m.Welcome(SESSION, 0), 2 * S)
-    assert [k.id for k in only(Keyframe, effects, messages=True)] == list(range(Config().link.window))
+    assert [k.id for k in only(Keyframe, effects, messages=True)] == list(range(WINDOW))
 
 
 # ---------------------------------------------------------------- rate

@@ -161,7 +161,7 @@ def test_after_a_failed_keyframe_the_next_motion_starts_at_the_last_published_on
 
 
 def test_a_reset_discards_the_unfinished_keyframe(walk: rig_fuzzer.Walk) -> None:
-    tracker, frame = InertialTracker(RIG, Config().inertial, Config().tracker), walk.frames[0]
+    tracker, frame = InertialTracker(RIG, Config().inertial), walk.frames[0]
     tracker.track(frame)
     tracker.make_keyframe(frame)
     tracker.reset_after_failure(frame)

@@ -24,13 +24,12 @@ from typing import Any
 
 import numpy as np
 import yaml
+from helpers.headset_reference import PairOutcome, PosePair, SpaceAlignment, pose_cov, predict_pose
 from helpers.headset_wearer import MAP_SIGMA, T_body_viewer, wearer
 
 from share.errors import UsageError
 from share.geometry import se3
-from share.headset.alignment import PairOutcome, PosePair, SpaceAlignment, pose_cov
 from share.headset.frame_times import MotionEstimate
-from share.headset.prediction import predict_pose
 from share.types import F64
 
 _HZ = 30

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,6 @@ from keyframe_set import AgentKeyframes, KeyframeSet, Spacing, keyframe_set, pla
 from make_keyframe_sets import parser as set_parser  # noqa: E402
 from make_keyframe_sets import recipe_of  # noqa: E402
 from measure_joins import configured  # noqa: E402
-from remembered import RememberingMapper  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
@@ -38,9 +37,12 @@ from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.se3 import umeyama  # noqa: E402
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS  # noqa: E402
+from share.lab.evaluate.kept_steps import KeptSteps  # noqa: E402
 from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
 from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
+from share.mapping.corrections import MapEvent  # noqa: E402
 from share.mapping.mapper import Mapper  # noqa: E402
+from share.mapping.steps import Step, VerifyStep  # noqa: E402
 from share.types import F64, OdometryKeyframe, View  # noqa: E402
 from share.wire.messages import Hello, peer_id  # noqa: E402
 
@@ -127,13 +129,51 @@ def claimed_runs(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[Trac
     return [(replace(hello, run_id=(hello.run_id + n) % 2**64), seen) for n, seen in enumerate(runs)]
 
 
+class _ClaimsMapper(Mapper):
+    """Records contradictions between agents. runs: run ids by agents' names."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.runs: dict[str, str] = {}
+        self._doubts: dict[frozenset[str], float] = {}  # largest so far
+        self._were_apart: set[frozenset[str]] = set()  # separated at any time
+
+    def add_run(self, agent: str, hello: Hello) -> None:
+        self.runs[hello.name] = agent
+        super().add_run(agent, hello)
+
+    def finish_step(self, step: Step, result: Any, ms: float) -> list[MapEvent]:
+        map_events = super().finish_step(step, result, ms)
+        if isinstance(step, VerifyStep):
+            agreement = self.atlas.quarantine.agreement
+            for names, doubt in agreement.contradictions().items():
+                pair = frozenset(names)
+                self._doubts[pair] = max(doubt, self._doubts.get(pair, 0.0))
+                if agreement.are_separated(*names):
+                    self._were_apart.add(pair)
+        return map_events
+
+    def doubt(self, of: Collection[str]) -> float:
+        """Return the largest contradiction ever between two of these."""
+        return max((doubt for pair, doubt in self._doubts.items() if pair <= set(of)), default=0.0)
+
+    def wronged(self, honest: Collection[str]) -> bool:
+        """Return whether two of these were ever separated."""
+        return any(pair <= set(honest) for pair in self._were_apart)
+
+
 class _Room(Simulation):
     """A simulation in which members are connected for a part of the time; they leave without a message."""
+
+    kept_steps = KeptSteps()  # of all runs
 
     def __init__(self, spans_ns: Mapping[bytes, tuple[int, int]], *args: Any, **kwargs: Any) -> None:
         """spans_ns: connected from .. to, by peer; members without a span always are."""
         self._spans_ns = spans_ns
         super().__init__(*args, **kwargs)
+
+    def _run_step(self, step: Any) -> object:
+        return self.kept_steps.run(step)
 
     def _to_agent(self, member: Any, event: Any) -> None:
         begins_ns, ends_ns = self._spans_ns.get(member.peer, (0, self.now_ns))
@@ -160,7 +200,7 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
     began_ns = min(seen[0].arrival_ns for _, seen in agents)
     ends_ns = max(seen[-1].arrival_ns for _, seen in agents)
     records: list[dict[str, object]] = []
-    mapper = RememberingMapper(config)
+    mapper = _ClaimsMapper(config)
     members = [
         (
             hello,

@@ -154,7 +154,7 @@ def faulty(case: Case, fault: Fault) -> list[Frame]:
 def tracked(rig: Rig, frames: list[Frame]) -> FaultRun:
     """Run one tracker over all frames."""
     config, log, results = Config(), RunLog(), []
-    tracker = InertialTracker(rig, config.inertial, config.tracker)
+    tracker = InertialTracker(rig, config.inertial)
     for frame in frames:
         began = time.process_time()
         result = tracker.track(frame)

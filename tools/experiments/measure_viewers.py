@@ -29,13 +29,14 @@ from typing import Any
 from share import startup
 
 startup.prepare_process()
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 import numpy as np  # noqa: E402
+from helpers.observed_simulation import observed_simulation  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.files.writing import atomic_write, writable_dir  # noqa: E402
-from share.lab.evaluate.observed_simulation import observed_simulation  # noqa: E402
 from share.lab.evaluate.real_time import share_command  # noqa: E402
 from share.recordings.session import Session, read_session  # noqa: E402
 from share.runtime.edge_observer import EdgeObserver  # noqa: E402

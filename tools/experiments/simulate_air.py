@@ -51,11 +51,11 @@ from air_figures import Row, print_tables  # noqa: E402
 from keyframe_set import KeyframeSet  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from modelled_mapper import ModelledMapper, RecognitionModel  # noqa: E402
+from modelled_room import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
-from simulate import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
-from share.config import NEAR_M, Config, ControlConfig  # noqa: E402
+from share.config import NEAR_M, Config, ControlConfig, with_policy  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.geometry.interpolation import Trajectory  # noqa: E402
 from share.lab.evaluate.emulated_network import NetworkModel, load_network  # noqa: E402
@@ -129,7 +129,7 @@ class SampledSimulation(Simulation):
 
     def call_at(self, t_s: float, action: Any) -> None:
         """Call `action` at a time of the simulation."""
-        self._schedule(round(t_s * 1e9) - self.now_ns, action)
+        self.schedule(round(t_s * 1e9) - self.now_ns, action)
 
 
 World = TypeVar("World", bound=SampledSimulation)
@@ -160,7 +160,7 @@ def main() -> int:
 def simulate(options: argparse.Namespace) -> None:
     """Run every policy on every air, seed by seed."""
     first, end = map(int, options.seeds.split(":"))
-    configs = {policy: with_policy(policy, options.set) for policy in options.policies}
+    configs = {policy: settings_of(policy, options.set) for policy in options.policies}
     terms = options.halved, options.late, options.sigma, options.alone
     rows: list[Row] = []
     for seed in range(first, end):
@@ -175,11 +175,11 @@ def simulate(options: argparse.Namespace) -> None:
     print_tables(rows)
 
 
-def with_policy(text: str, settings: list[str]) -> Config:
+def settings_of(text: str, settings: list[str]) -> Config:
     """Return the settings with a policy, such as `fixed@0.5`. Raises UsageError."""
     name, _, terms = text.partition("@")
     if constant_rates(text) is not None:
-        return with_policy("share", settings)
+        return settings_of("share", settings)
     if name not in SIMULATED:
         raise UsageError(
             f"--policies {text}: expected one of {', '.join(SIMULATED)}, or fixed@HZ, constant@A:R"
@@ -187,7 +187,7 @@ def with_policy(text: str, settings: list[str]) -> Config:
     hz, _, quality = terms.partition("q")
     given = {"fixed_rate_hz": hz, "fixed_jpeg_quality": quality}
     config = configured([*settings, *(f"control.{key}={value}" for key, value in given.items() if value)])
-    return replace(config, edge=replace(config.edge, policy=name))
+    return with_policy(config, name)
 
 
 class ConstantRates(Policy):

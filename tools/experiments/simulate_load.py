@@ -19,7 +19,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,7 @@ import numpy as np  # noqa: E402
 from replayed_agents import ReplayedAgent, Track, track_session  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.config import POLICY_NAMES, STREAMED, Config  # noqa: E402
+from share.config import POLICY_NAMES, STREAMED, Config, with_policy  # noqa: E402
 from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
 from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
 from share.lab.evaluate.simulation import Simulation  # noqa: E402
@@ -80,14 +79,14 @@ class ChargedSimulation(Simulation):
             map_events += found
             spent_ns += took_ns
         self._start_solving(spent_ns)
-        self._schedule(spent_ns, lambda: self._send_map_events(map_events))
+        self.schedule(spent_ns, lambda: self._send_map_events(map_events))
         step, took_ns = self._charge_mapper("next", self.mapper.next_lookup)
         spent_ns += took_ns
         if step is None:
-            self._schedule(spent_ns, self._mapper_idle)
+            self.schedule(spent_ns, self._mapper_idle)
             return
         result, took_ns = self._charge_mapper(step.kind, step.run)
-        self._schedule(spent_ns + took_ns, lambda: self._step_done(step, result))
+        self.schedule(spent_ns + took_ns, lambda: self._step_done(step, result))
 
     def _step_done(self, step: Any, result: object) -> None:
         found, took_ns = self._charge_mapper("judge", partial(self.mapper.finish_step, step, result, 0.0))
@@ -96,7 +95,7 @@ class ChargedSimulation(Simulation):
             self._send_map_events(found)
             self._run_mapper_round()
 
-        self._schedule(took_ns, go_on)
+        self.schedule(took_ns, go_on)
 
     def _start_solving(self, after_ns: int) -> None:
         if (step := self.mapper.next_solve()) is not None:
@@ -104,7 +103,7 @@ class ChargedSimulation(Simulation):
             self.solver_busy_ns += took_ns
             apply_result = partial(self.mapper.finish_step, step, result, 0.0)
             delay = self._delays.apply_solution  # not used
-            self._schedule(after_ns + took_ns, lambda: self._send_to_mapper(delay, apply_result))
+            self.schedule(after_ns + took_ns, lambda: self._send_to_mapper(delay, apply_result))
 
 
 def main() -> int:
@@ -125,7 +124,7 @@ def simulate(options: argparse.Namespace) -> None:
     """Simulate every number of agents."""
     tracks = track_session(read_session(options.session))
     config = Config()
-    config = replace(config, edge=replace(config.edge, policy=options.policy))
+    config = with_policy(config, options.policy)
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
     rows = []
     for count in options.agents:

@@ -28,9 +28,10 @@ import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet, Spacing  # noqa: E402
 from measure_joins import configured  # noqa: E402
-from simulate import SIMULATED, Row, mean, play  # noqa: E402
+from modelled_room import SIMULATED, Row, mean, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
+from share.config import with_policy  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
 from share.spawning import SPAWN_CONTEXT  # noqa: E402
@@ -90,10 +91,7 @@ def _played(job: Job) -> list[Row]:
     """Return a run by each policy."""
     (rooms, each), seed, policies, link, settings = job
     made, config = apart([_room(seed + 1000 * k, each) for k in range(rooms)]), configured(settings)
-    return [
-        play(made, replace(config, edge=replace(config.edge, policy=policy)), link, seed, modelled=True)
-        for policy in policies
-    ]
+    return [play(made, with_policy(config, policy), link, seed) for policy in policies]
 
 
 def _room(seed: int, agents: int) -> KeyframeSet:

@@ -25,7 +25,7 @@ startup.prepare_process()
 
 import numpy as np  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
-from simulate_air import SampledSimulation, begin, with_policy  # noqa: E402
+from simulate_air import SampledSimulation, begin, settings_of  # noqa: E402
 from step_response import StepResponse, step_response  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
@@ -83,7 +83,7 @@ def main() -> int:
 
 def simulate(options: argparse.Namespace) -> None:
     """Run every step on every air, and print how rates and delays answer."""
-    config, seeds = with_policy(options.policy, options.set), range(*map(int, options.seeds.split(":")))
+    config, seeds = settings_of(options.policy, options.set), range(*map(int, options.seeds.split(":")))
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
     for air in options.air:
         for step in options.steps:

@@ -22,11 +22,11 @@ import numpy as np  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.files.writing import atomic_write  # noqa: E402
-from share.lab.evaluate.report import csv_text  # noqa: E402
 from share.lab.study.orders import draw_orders  # noqa: E402
 from share.lab.study.plan import PAPER_POLICIES  # noqa: E402
 from share.lab.study.rank_tests import friedman, holm, wilcoxon  # noqa: E402
 from share.lab.study.repeated_anova import repeated_anova  # noqa: E402
+from share.lab.tables import csv_text  # noqa: E402
 from share.types import F64  # noqa: E402
 
 SUMS, CALLS, PARTICIPANTS, CHI2 = (142, 114, 110, 86), 10, 20, 13.24

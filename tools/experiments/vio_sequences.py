@@ -135,7 +135,17 @@ def _seeds(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"'{text}' is not a list of numbers such as 101,102") from None
 
 
-_NOT_IN_A_RUN = ("cli", "emulate", "merge", "mocap", "wire")  # packages of share/ that a run does not use
+_NOT_IN_A_RUN = (
+    "cli",
+    "headset",
+    "lab",
+    "mapping",
+    "net",
+    "robot",
+    "store",
+    "view",
+    "wire",
+)  # packages of share/
 
 
 def code_version() -> str:

@@ -1,4 +1,4 @@
-// Where a headset's own space is in the shared map: share/headset/alignment.py in JavaScript, held to the same vectors.
+// Where a headset's own space is in the shared map: tests/helpers/headset_reference.py in JavaScript, held to the same vectors.
 // Local and viewer are in WebXR's axes; T_body_viewer, the mount, takes care of the rest.
 import { adjoint, apply6, congruence6, exp, inverse, log, multiply, orthonormal, product6, solve6 } from "./math.js";
 

@@ -1,4 +1,4 @@
-// Where a head will be when a frame is shown: share/headset/prediction.py in JavaScript.
+// Where a head will be when a frame is shown: tests/helpers/headset_reference.py in JavaScript.
 import { exp, multiply } from "./math.js";
 
 export const MAX_AHEAD_S = 0.1;  // beyond, a head has turned otherwise

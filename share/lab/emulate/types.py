@@ -120,3 +120,13 @@ class MotionPath(Protocol):
 
 GRAVITY = 9.81  # m/s^2
 START_NS = 1_750_000_000 * 10**9  # of simulated paths, at session time 0; an arbitrary constant
+
+
+def stamps_within(stamps_ns: I64, start_ns: int, end_ns: int) -> I64:
+    """Return stamps (N,) as they are. Raises ValueError where the path does not span one."""
+    stamps = np.asarray(stamps_ns, np.int64)
+    if len(stamps) and not start_ns <= stamps.min() <= stamps.max() <= end_ns:
+        raise ValueError(
+            f"stamps {stamps.min()} .. {stamps.max()} ns: the path spans {start_ns} .. {end_ns} ns"
+        )
+    return stamps

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from share.lab.evaluate.paper_plan import BASE, OURS, THEIRS
 from share.lab.evaluate.policy_report import agent_mean
-from share.lab.evaluate.report import format_number, markdown_table
 from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.statistics import (
     Interval,
@@ -20,6 +19,7 @@ from share.lab.evaluate.statistics import (
     policy_names,
 )
 from share.lab.evaluate.views_of_others import DriftBesideOthers
+from share.lab.tables import format_number, markdown_table
 from share.lab.train.score import ErrorModelScore, score_table
 
 

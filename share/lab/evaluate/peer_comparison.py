@@ -22,9 +22,10 @@ from share.files.json_file import nan_to_none, none_to_nan, read_json, to_plain
 from share.files.writing import atomic_write
 from share.lab.evaluate.charts import draw_bars
 from share.lab.evaluate.provenance import describe_machine
-from share.lab.evaluate.report import bullets, csv_text, format_number, image_link, markdown_table
+from share.lab.evaluate.report import bullets, image_link
 from share.lab.evaluate.tracker_runs import TrackerRun, can_run_peers, peer_version, run_peer, run_share
 from share.lab.peer_trackers import PEERS
+from share.lab.tables import csv_text, format_number, markdown_table
 from share.metrics.ate import ate
 from share.metrics.rpe import rpe_time
 from share.plain_data import to_mapping

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from share.files.json_file import nan_to_none
-from share.lab.evaluate.report import format_number, markdown_table, provenance
+from share.lab.evaluate.report import provenance
 from share.lab.evaluate.run_metrics import RunMetrics
 from share.lab.evaluate.statistics import (
     Interval,
@@ -20,6 +19,7 @@ from share.lab.evaluate.statistics import (
     policy_names,
 )
 from share.lab.evaluate.trial import Trial
+from share.lab.tables import format_number, latex_tabular, markdown_table
 
 _HEADLINE = ("AR latency", "merges per metre", "joint ATE")  # measures in the first sentence
 _INTERVAL_NOTE = "95 %: confidence intervals by bootstrap over sessions, each with all its runs."
@@ -56,7 +56,7 @@ def markdown(
     parts = ["# Policies compared", _headline(compared, base), _meetings(runs, names)]
     if failed:
         parts.append(f"FAILED, and not in this report: {', '.join(failed)}.")
-    parts += ["## Each policy", _values(compared), _VALUES_NOTE]
+    parts += ["## Each policy", markdown_table(_values(compared)), _VALUES_NOTE]
     if other_policies:
         note = _RATIOS_NOTE + (f" {_INTERVAL_NOTE}" if _has_intervals(compared) else "")
         parts += [f"## Ratios to `{base}`", _ratios(compared, other_policies), note, pictures.comparison]
@@ -118,12 +118,13 @@ def _known_measures(compared: _Comparisons) -> list[tuple[int, Measure]]:
     ]
 
 
-def _values(compared: _Comparisons) -> str:
+def _values(compared: _Comparisons) -> list[list[str]]:
+    """Return a table of the policies' values."""
     rows = [["", *compared]]
     for k, measure in _known_measures(compared):
         cells = best_in_bold([of[k].value.value for of in compared.values()], measure.better)
         rows.append([measure.title, *cells])
-    return markdown_table(rows)
+    return rows
 
 
 def best_in_bold(values: Sequence[float], better: int) -> list[str]:
@@ -223,27 +224,8 @@ def comparison_document(runs: Sequence[RunMetrics], base: str) -> dict[str, Any]
     return {"base": base, "runs": len(runs), "policies": policies}
 
 
-# LaTeX
-
-
 def latex_table(runs: Sequence[RunMetrics], base: str) -> str:
-    """Return a LaTeX tabular of the policies' values, the best in bold; it needs no package."""
-    names = policy_names(runs)
-    compared = {name: compare_policies(runs, name, base) for name in names}
-    lines = [
-        f"% {len(runs)} runs; means over runs that have a value; best in bold",
-        f"\\begin{{tabular}}{{l{'r' * len(names)}}}",
-        "\\hline",
-        " & ".join(["", *map(_tex, names)]) + r" \\",
-        "\\hline",
-    ]
-    for k, measure in _known_measures(compared):
-        cells = best_in_bold([compared[name][k].value.value for name in names], measure.better)
-        bold = [re.sub(r"\*\*(.+)\*\*", r"\\textbf{\1}", cell).replace("–", "--") for cell in cells]
-        lines.append(" & ".join([_tex(measure.title), *bold]) + r" \\")
-    return "\n".join([*lines, "\\hline", "\\end{tabular}"]) + "\n"
-
-
-def _tex(text: str) -> str:
-    """Return text with LaTeX's own characters escaped."""
-    return re.sub(r"([&%$#_{}])", r"\\\1", text)
+    """Return a LaTeX tabular of the policies' values, the best in bold."""
+    compared = {name: compare_policies(runs, name, base) for name in policy_names(runs)}
+    note = f"% {len(runs)} runs; means over runs that have a value; best in bold"
+    return f"{note}\n{latex_tabular(_values(compared))}\n"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import csv
 import dataclasses
 import html
-import io
 import math
 import re
 from collections import Counter
@@ -19,36 +17,11 @@ from typing import Any
 from share.errors import DataError, UsageError
 from share.files.reading import MAX_SETTINGS_BYTES, path_inside, read_text
 from share.lab.evaluate.run_metrics import AgentMetrics, Conditions, RunMetrics
-from share.lab.evaluate.statistics import (
-    MEASURES,
-)
+from share.lab.evaluate.statistics import MEASURES
 from share.lab.evaluate.trial import Trial
+from share.lab.tables import csv_text, format_number, markdown_table
 from share.lab.train.score import read_scores, score_table
 from share.recordings.images import read_picture
-
-# Tables as text. Unknown values are empty in CSV, a dash in Markdown.
-
-
-def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return CSV; floats with six digits, NaN as an empty cell."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    for row in rows:
-        writer.writerow([_cell(value) for value in row])
-    return text.getvalue()
-
-
-def _cell(value: object) -> object:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.6g}"
-    return value
-
-
-def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table; the first of `rows` is its head."""
-    head, *body = rows
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))
 
 
 def bullets(texts: Iterable[str]) -> str:
@@ -59,10 +32,6 @@ def bullets(texts: Iterable[str]) -> str:
 def image_link(caption: str, name: str) -> str:
     """Return a Markdown image paragraph; `name`: a file beside the text."""
     return f"![{caption}]({name})"
-
-
-def format_number(value: float, form: str = ".3g") -> str:
-    return "–" if math.isnan(value) else format(value, form)
 
 
 # Extra sections of a report: sweeps of settings, comparisons of error models.

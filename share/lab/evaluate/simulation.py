@@ -103,10 +103,10 @@ class Simulation:
         self.airs: dict[NetworkModel, SharedAir] = {}  # of the access points
         for network in dict.fromkeys(network for *_, network in agents):
             if network.air is not None:
-                self.airs[network] = SharedAir(network.air, rng.spawn(1)[0], self._schedule)
+                self.airs[network] = SharedAir(network.air, rng.spawn(1)[0], self.schedule)
         self._store = store
         self._start_edge(1, mapper)
-        self._schedule(0, self._tick)
+        self.schedule(0, self._tick)
 
     def _start_edge(self, session: int, mapper: Mapper | None = None) -> None:
         """Start edge and mapper with what the store keeps, or empty."""
@@ -132,7 +132,8 @@ class Simulation:
         """Return each agent's protocol report, by name."""
         return {member.name: member.machine.report() for member in self._members.values()}
 
-    def _schedule(self, delay_ns: int, action: Callable[[], None]) -> None:
+    def schedule(self, delay_ns: int, action: Callable[[], None]) -> None:
+        """Call `action` after a delay."""
         heapq.heappush(self._events, (self.now_ns + delay_ns, next(self._order), action))
 
     def _draw(self, cost: Delay | MeasuredDelay) -> int:
@@ -142,7 +143,7 @@ class Simulation:
         for member in self._members.values():
             self._to_agent(member, ev.AgentTick())
         self._to_edge(Tick())
-        self._schedule(_TICK_MS * MS_NS, self._tick)
+        self.schedule(_TICK_MS * MS_NS, self._tick)
 
     # Agents.
 
@@ -159,7 +160,7 @@ class Simulation:
 
     def _schedule_next_frame(self, member: SimulatedRun) -> None:
         if (frame := next(member.incoming, None)) is not None:
-            self._schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
+            self.schedule(max(0, frame.arrival_ns - self.now_ns), lambda: self._frame_arrived(member, frame))
 
     def _frame_arrived(self, member: SimulatedRun, tracked: TrackedFrame) -> None:
         """Schedule the results of a frame, which waits until earlier frames are done, as in the agent's
@@ -180,11 +181,11 @@ class Simulation:
             cov=tracked.cov,
         )
         member.frames_count += 1
-        self._schedule(done_ns - self.now_ns, lambda: self._to_agent(member, frame))
+        self.schedule(done_ns - self.now_ns, lambda: self._to_agent(member, frame))
         if (candidate := tracked.candidate) is not None:
             member.busy_until_ns += self._draw(self._delays.keyframe)
             keyframe_event = ev.KeyframeMade(frame, candidate)
-            self._schedule(member.busy_until_ns - self.now_ns, lambda: self._to_agent(member, keyframe_event))
+            self.schedule(member.busy_until_ns - self.now_ns, lambda: self._to_agent(member, keyframe_event))
         member.busy_until_ns += self._draw(self._delays.finish_keyframe)
         self._schedule_next_frame(member)
 
@@ -211,7 +212,7 @@ class Simulation:
         def on_air_done() -> None:
             arrival_ns = member.up.arrival_ns(size, self.now_ns) + self._draw(self._delays.receive)
             member.received_ns = max(member.received_ns, arrival_ns)  # in the order of the link
-            self._schedule(
+            self.schedule(
                 member.received_ns - self.now_ns,
                 lambda: self._to_edge(ed.PeerMessageReceived(member.peer, frames)),
             )
@@ -250,7 +251,7 @@ class Simulation:
 
         def on_air_done() -> None:
             arrival_ns = member.down.arrival_ns(size, self.now_ns)
-            self._schedule(
+            self.schedule(
                 arrival_ns - self.now_ns, lambda: self._to_agent(member, EdgeMessageReceived(frames))
             )
 
@@ -273,7 +274,7 @@ class Simulation:
     # The mapper process, as in share.runtime.mapper_process.
 
     def _schedule_mapper(self, delay_ns: int, action: Callable[[], None]) -> None:
-        self._schedule(delay_ns, action)
+        self.schedule(delay_ns, action)
 
     def _send_to_mapper(self, delay: Delay, action: Callable[[], list[MapEvent]]) -> None:
         self._inbox.append((delay, action))

@@ -38,7 +38,7 @@ class BreakableRoom(Simulation):
         self._is_edge_up = True
         self._start_edge(self._edge_life)
         for member in self._members.values():
-            self._schedule(_RECONNECT_NS, lambda member=member: self._to_agent(member, Connected()))  # type: ignore[misc]
+            self.schedule(_RECONNECT_NS, lambda member=member: self._to_agent(member, Connected()))  # type: ignore[misc]
 
     def _to_edge(self, event: ed.EdgeEvent) -> None:
         if self._is_edge_up:
@@ -51,7 +51,7 @@ class BreakableRoom(Simulation):
             if life == self._edge_life:
                 action()
 
-        self._schedule(delay_ns, act)
+        self.schedule(delay_ns, act)
 
     # ------------------------------------------------------------ an agent
 
@@ -62,7 +62,7 @@ class BreakableRoom(Simulation):
     def start_agent(self, hello: Hello, network: NetworkModel, seed: int) -> None:
         """Start another run of an agent, whose frames are pushed."""
         self._add_member(hello, iter(()), network, np.random.default_rng((seed, hello.run_id)).spawn(2))
-        self._schedule(_RECONNECT_NS, lambda: self._to_agent(self.run_of(hello.name), Connected()))
+        self.schedule(_RECONNECT_NS, lambda: self._to_agent(self.run_of(hello.name), Connected()))
 
     def run_of(self, name: str) -> SimulatedRun:
         """Return the newest run of an agent. Raises KeyError without one."""
@@ -89,7 +89,7 @@ class BreakableRoom(Simulation):
 
     def _send_up(self, member: SimulatedRun, frames: Sequence[Bytes]) -> None:
         if held_ns := self._held_ns(member):
-            self._schedule(held_ns, lambda: self._send_up(member, frames))
+            self.schedule(held_ns, lambda: self._send_up(member, frames))
         else:
             super()._send_up(member, frames)
 
@@ -98,6 +98,6 @@ class BreakableRoom(Simulation):
         if member is None:
             return
         if held_ns := self._held_ns(member):
-            self._schedule(held_ns, lambda: self._send_down(effect))
+            self.schedule(held_ns, lambda: self._send_down(effect))
         else:
             super()._send_down(effect)

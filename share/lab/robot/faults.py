@@ -46,8 +46,8 @@ def schedule_faults(loop: RobotLoop, faults: Sequence[LoopFault]) -> None:
     """Let faults happen in a loop that has not begun."""
     for fault in faults:
         begin, end = _actions(loop, fault)
-        loop.after(seconds_to_ns(fault.at_s), begin)
-        loop.after(seconds_to_ns(fault.at_s + fault.seconds), end)
+        loop.schedule(seconds_to_ns(fault.at_s), begin)
+        loop.schedule(seconds_to_ns(fault.at_s + fault.seconds), end)
 
 
 def _actions(loop: RobotLoop, fault: LoopFault) -> tuple[Callable[[], None], Callable[[], None]]:

@@ -109,9 +109,9 @@ class RobotLoop(BreakableRoom):
         self.bridge: RobotBridge | None = None
         self.start_bridge()
         for action in (self._send_odometry, self._control, self._bridge_tick, self._look, self._write_trace):
-            self._schedule(0, action)
+            self.schedule(0, action)
         for number, time_ns in enumerate(agent.frame_times_ns if agent else frame_times_ns):
-            self._schedule(time_ns, lambda number=number: self._take_frame(number))  # type: ignore[misc]
+            self.schedule(time_ns, lambda number=number: self._take_frame(number))  # type: ignore[misc]
 
     def note(self, text: str) -> None:
         """Keep a line, with its time."""
@@ -121,8 +121,8 @@ class RobotLoop(BreakableRoom):
 
     def _send_odometry(self) -> None:
         step, made_ns = self.base.at(self.now_ns), self.now_ns + START_NS
-        self._schedule(_DDS_NS, lambda: self.navigator.take_odometry(step.T_odom_base))
-        self._schedule(
+        self.schedule(_DDS_NS, lambda: self.navigator.take_odometry(step.T_odom_base))
+        self.schedule(
             _DDS_NS,
             lambda: self.to_bridge(
                 ev.OdometryReceived(
@@ -130,13 +130,13 @@ class RobotLoop(BreakableRoom):
                 )
             ),
         )
-        self._schedule(_ODOMETRY_NS, self._send_odometry)
+        self.schedule(_ODOMETRY_NS, self._send_odometry)
 
     def _look(self) -> None:
         """Give the navigator what a lidar sees."""
         T_world_base = self.base.at(self.now_ns).T_world_base
         self.navigator.take_costmap(Costmap(self._grid, T_world_base.inverse(), self._people_at(self.now_ns)))
-        self._schedule(_COSTMAP_NS, self._look)
+        self.schedule(_COSTMAP_NS, self._look)
 
     def _control(self) -> None:
         command = self.navigator.tick(self.now_ns)
@@ -149,18 +149,18 @@ class RobotLoop(BreakableRoom):
                 command = CmdVel(STOP.speed_m_s, command.turn_rad_s)
             self.base.command(self.now_ns, command.speed_m_s, command.turn_rad_s)
         self._publish_status()
-        self._schedule(seconds_to_ns(CONTROL_S), self._control)
+        self.schedule(seconds_to_ns(CONTROL_S), self._control)
 
     def _publish_status(self) -> None:
         statuses = tuple(self.navigator.statuses.items())
         if statuses != self._statuses:
             self._statuses = statuses
-            self._schedule(_DDS_NS, lambda: self.to_bridge(ev.StatusReceived(statuses)))
+            self.schedule(_DDS_NS, lambda: self.to_bridge(ev.StatusReceived(statuses)))
         self._control_count += 1
         distance_m = self.navigator.distance_m
         if distance_m is not None and statuses and self._control_count % _FEEDBACK_TICKS == 0:
             feedback = ev.FeedbackReceived(statuses[-1][0], distance_m)
-            self._schedule(_DDS_NS, lambda: self.to_bridge(feedback))
+            self.schedule(_DDS_NS, lambda: self.to_bridge(feedback))
 
     def _write_trace(self) -> None:
         report = None if self.bridge is None else self.bridge.report(self.now_ns)
@@ -168,7 +168,7 @@ class RobotLoop(BreakableRoom):
         map_id = None if report is None else report["map_id"]
         self.trace.append((self.now_ns / 1e9, self.base.at(self.now_ns).T_world_base, pose, map_id))
         self.on_trace()
-        self._schedule(_TRACE_NS, self._write_trace)
+        self.schedule(_TRACE_NS, self._write_trace)
 
     # ------------------------------------------------------------ the robot's agent
 
@@ -194,17 +194,13 @@ class RobotLoop(BreakableRoom):
         if self._agent is not None:
             self._agent.show_bare_wall(is_shown)
 
-    def after(self, delay_ns: int, action: Callable[[], None]) -> None:
-        """Call `action` after a delay."""
-        self._schedule(delay_ns, action)
-
     def _send_own_pose(self, T_map_base: PlanarPose) -> None:
         T_map_body = solid_pose(T_map_base) @ self._T_base_body
         sequence = round(self.now_ns / _MS)
         event = ev.AgentPoseReceived(
             ROBOT, sequence, TrackState.OK, T_map_body, "own", 1e-3, _POSE_AGE_NS, None
         )
-        self._schedule(_POSE_AGE_NS, lambda: self.to_bridge(event))
+        self.schedule(_POSE_AGE_NS, lambda: self.to_bridge(event))
 
     def _take_agent_effect(self, name: str, effect: aev.AgentEffect) -> None:
         if isinstance(effect, aev.LocalisedPose):
@@ -230,15 +226,15 @@ class RobotLoop(BreakableRoom):
     def _send_message(self, text: str) -> None:
         pose = parse_pose_message(text.encode())
         aged = replace(pose, age_ns=(pose.age_ns or 0) + _LOCAL_NS)
-        self._schedule(_LOCAL_NS, lambda: self.to_bridge(aged))
+        self.schedule(_LOCAL_NS, lambda: self.to_bridge(aged))
 
     # ------------------------------------------------------------ the bridge
 
     def start_bridge(self) -> None:
         """Start a bridge; it finds the robot and what status its navigation has latched."""
         self.bridge = RobotBridge(self._settings)
-        self._schedule(_DDS_NS, lambda: self.to_bridge(ev.RobotDiscovered(1, 1, release="jazzy")))
-        self._schedule(_DDS_NS, lambda: self.to_bridge(ev.StatusReceived(self._statuses)))
+        self.schedule(_DDS_NS, lambda: self.to_bridge(ev.RobotDiscovered(1, 1, release="jazzy")))
+        self.schedule(_DDS_NS, lambda: self.to_bridge(ev.StatusReceived(self._statuses)))
 
     def kill_bridge(self) -> None:
         """End the bridge at once, and with it the commands that wait for it."""
@@ -249,7 +245,7 @@ class RobotLoop(BreakableRoom):
 
     def _bridge_tick(self) -> None:
         self.to_bridge(Tick())
-        self._schedule(_TICK_NS, self._bridge_tick)
+        self.schedule(_TICK_NS, self._bridge_tick)
 
     def to_bridge(self, event: ev.RobotEvent) -> None:
         """Let the bridge handle an event, if there is one, and carry its effects out."""
@@ -263,15 +259,15 @@ class RobotLoop(BreakableRoom):
         match effect:
             case ev.PublishMapOdom():
                 until_ns, T = effect.stamp_ns - START_NS, effect.T_map_odom
-                self._schedule(_DDS_NS, lambda: navigator.take_map_odom(until_ns, T))
+                self.schedule(_DDS_NS, lambda: navigator.take_map_odom(until_ns, T))
             case ev.SendGoal():
                 goal_id, goal = effect.goal_id, effect.T_map_base
-                self._schedule(_DDS_NS, lambda: navigator.take_goal(goal_id, goal))
+                self.schedule(_DDS_NS, lambda: navigator.take_goal(goal_id, goal))
             case ev.CancelGoal():
                 cancelled = effect.goal_id
-                self._schedule(_DDS_NS, lambda: navigator.cancel(cancelled))
+                self.schedule(_DDS_NS, lambda: navigator.cancel(cancelled))
             case ev.AskResult():
-                self._schedule(2 * _DDS_NS, lambda: self.to_bridge(ev.ResultReceived(navigator.abort_code)))
+                self.schedule(2 * _DDS_NS, lambda: self.to_bridge(ev.ResultReceived(navigator.abort_code)))
             case ev.LimitSpeed():
                 navigator.limit_speed(effect.speed_m_s)
             case ev.GoalReport():

@@ -8,7 +8,6 @@ does not. Source: J. Cohen, Statistical Power Analysis for the Behavioral Scienc
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ from share.lab.study.rank_tests import average_ranks
 from share.lab.study.repeated_anova import RepeatedAnova, noncentrality_interval
 from share.types import F64
 
-ALPHA = 0.05
+ALPHA, _POWER = 0.05, 0.8
 _SIZES = (8, 12, 16, 20, 24, 32, 40, 60, 80)
 _RESAMPLES = 2000
 _SEED = 1
@@ -65,7 +64,7 @@ class NextStudy:
     needed_at_worst: int | None
 
 
-def next_study(values: F64, anova: RepeatedAnova, sizes: Sequence[int] = _SIZES) -> NextStudy | None:
+def next_study(values: F64, anova: RepeatedAnova) -> NextStudy | None:
     """Return power with the effect found in values (n, k); None where there is no F."""
     if math.isnan(anova.f) or anova.df_error < 3:
         return None
@@ -74,24 +73,24 @@ def next_study(values: F64, anova: RepeatedAnova, sizes: Sequence[int] = _SIZES)
     each = max(0.0, unbiased) / anova.participants
     worst = noncentrality_interval(anova.f, anova.df, anova.df_error)[0] / anova.participants
     return NextStudy(
-        tuple(sizes),
-        tuple(anova_power(each, k, size, epsilon) for size in sizes),
-        tuple(friedman_power(values, size) for size in sizes),
+        _SIZES,
+        tuple(anova_power(each, k, size, epsilon) for size in _SIZES),
+        tuple(friedman_power(values, size) for size in _SIZES),
         _needed(each, k, epsilon),
         _needed(worst, k, epsilon),
     )
 
 
-def _needed(noncentrality: float, conditions: int, epsilon: float, power: float = 0.8) -> int | None:
-    """Return the least number of participants with that power, by bisection, since power rises with it."""
+def _needed(noncentrality: float, conditions: int, epsilon: float) -> int | None:
+    """Return the least number of participants with 80 % power, by bisection: it rises with them."""
     low, high = 2, _MAX_PARTICIPANTS
     if math.isinf(noncentrality):
         return low
-    if not anova_power(noncentrality, conditions, high, epsilon) >= power:
+    if not anova_power(noncentrality, conditions, high, epsilon) >= _POWER:
         return None
     while low < high:
         middle = (low + high) // 2
-        if anova_power(noncentrality, conditions, middle, epsilon) < power:
+        if anova_power(noncentrality, conditions, middle, epsilon) < _POWER:
             low = middle + 1
         else:
             high = middle

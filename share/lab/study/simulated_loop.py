@@ -57,11 +57,11 @@ class StudyLoop(RobotLoop):
             self._over_the_air(down, _ACCESS_POINT, size, arrive)
 
         def arrive() -> None:
-            self._schedule(down.down.arrival_ns(size, self.now_ns) - self.now_ns, done)
+            self.schedule(down.down.arrival_ns(size, self.now_ns) - self.now_ns, done)
 
         def leave() -> None:
             delay_ns = up.up.arrival_ns(size, self.now_ns) + self._draw(self._delays.receive) - self.now_ns
-            self._schedule(delay_ns, at_edge)
+            self.schedule(delay_ns, at_edge)
 
         self._over_the_air(up, up.name, size, leave)
 

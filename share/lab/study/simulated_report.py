@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.files.json_file import read_json_lines
-from share.lab.evaluate.report import format_number
 from share.lab.study.plan import PAPER_POLICIES
 from share.lab.study.simulated_study import OWN_AGENTS, SimulatedStudy
 from share.lab.study.trials import EVENTS, CalledGoal, read_trials, trial_folder
+from share.lab.tables import format_number
 
 _Z = 1.96
 Rows = list[list[str]]

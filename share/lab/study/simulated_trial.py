@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from share.config import Config
+from share.config import Config, with_policy
 from share.files.writing import atomic_write, writable_dir
 from share.geometry.camera import Rig
 from share.geometry.se3 import inverse
@@ -87,12 +87,11 @@ def carry_out(job: TrialJob) -> TrialDone:
 class SimulatedTrial:
     """A trial of participant number `index` with a policy, before or after its drive. planned: its way."""
 
-    def __init__(self, study: SimulatedStudy, index: int, policy: str, config: Config | None = None) -> None:
+    def __init__(self, study: SimulatedStudy, index: int, policy: str) -> None:
         self._study, self._index = study, index
         room, session, self.planned = _participant(study.folder, index)
         settings, name = study.settings, study.plan.participants[index].name
-        config = Config() if config is None else config
-        config = replace(config, edge=replace(config.edge, policy=policy))
+        config = with_policy(Config(), policy)
         seed, seconds = settings.seed * 1000 + index, self.planned.seconds + _TAIL_S
         rngs = [np.random.default_rng((seed, stream)) for stream in range(3)]
         robot, network = usual_robot(), load_network(settings.network)

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from share.errors import ShareError
 from share.files.writing import sync_folder, write_errors
 
 
@@ -68,16 +67,6 @@ class StudyLog:
                 raise
             self._handle = handle
         return self._handle
-
-
-def free_bytes(folder: Path) -> int:
-    """Return what the disk of a folder, or of the nearest one above it, has left. Raises ShareError."""
-    there = next(one for one in (folder, *folder.resolve().parents) if one.exists())
-    try:
-        status = os.statvfs(there)
-    except OSError as error:
-        raise ShareError(f"{there}: {error.strerror or error}") from None
-    return status.f_bavail * status.f_frsize
 
 
 def _complete_bytes(handle: int) -> int:

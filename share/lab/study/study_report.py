@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from share.files.writing import atomic_write
-from share.lab.evaluate.report import bullets, csv_text, html_page, image_link, markdown_table
+from share.lab.evaluate.report import bullets, html_page, image_link
 from share.lab.study.observations import Observations
 from share.lab.study.plan import SuccessRule
 from share.lab.study.repeated_anova import PartialF
@@ -25,6 +25,7 @@ from share.lab.study.study_tables import (
     power_rows,
     rule_line,
 )
+from share.lab.tables import csv_text, latex_tabular, latex_text, markdown_table
 
 FILES = ("report.html", "report.md", "descriptives.csv", "tests.csv", "pairs.csv", "tables.tex")
 METHODS = (
@@ -193,32 +194,6 @@ def _latex(study: StudyAnalysis) -> str:
 
 
 def latex_table(rows: Rows, caption: str) -> str:
-    """Return a LaTeX table of rows with their head; needs no package."""
-    columns = "l" + "r" * (len(rows[0]) - 1)
-    # {}: else \\ takes a [ or * of the next row for its own
-    head, *body = ("{}" + " & ".join(map(_latex_text, row)) + r" \\" for row in rows)
-    lines = [
-        r"\begin{table}",
-        rf"\caption{{{_latex_text(caption)}}}",
-        rf"\begin{{tabular}}{{{columns}}}",
-        r"\hline",
-    ]
-    return "\n".join([*lines, head, r"\hline", *body, r"\hline", r"\end{tabular}", r"\end{table}"])
-
-
-_LATEX = {char: "\\" + char for char in "&%$#_{}"} | {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": "$<$",
-    ">": "$>$",
-    "χ": r"$\chi$",
-    "²": "$^2$",
-    "η": r"$\eta$",
-    "ε": r"$\epsilon$",
-    "–": "--",
-}
-
-
-def _latex_text(text: str) -> str:
-    return "".join(_LATEX.get(char, char) for char in text)
+    """Return a LaTeX table of rows with their head."""
+    lines = [r"\begin{table}", rf"\caption{{{latex_text(caption)}}}", latex_tabular(rows), r"\end{table}"]
+    return "\n".join(lines)

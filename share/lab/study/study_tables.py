@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from share.lab.evaluate.report import format_number
 from share.lab.evaluate.statistics import Interval
 from share.lab.study.plan import SuccessRule
 from share.lab.study.power import ALPHA, NextStudy
 from share.lab.study.repeated_anova import PartialF
 from share.lab.study.study_analysis import MIN_COMPLETE, StudyAnalysis
+from share.lab.tables import format_number
 from share.robot.settings import CREATE3_SPEED_M_S
 
 _NOTHING = 1e-12  # below this a number is what rounding left

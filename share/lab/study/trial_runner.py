@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
+from share.devices.host import free_disk_bytes
 from share.errors import ShareError
+from share.files.writing import write_errors
 from share.lab.study import trial_events as te
 from share.lab.study import trial_machine as tm
 from share.lab.study.floor import SPOT_ID, STUDY_NAME, StudyFloor, find_markers, floor_of
 from share.lab.study.readiness import Readiness, RoomState, check_room
-from share.lab.study.study_log import StudyLog, free_bytes
+from share.lab.study.study_log import StudyLog
 from share.lab.study.study_room import StudyRoom
 from share.protocol.room_events import CommandChanged, ObjectChanged, RobotSeen
 from share.wire.room_messages import ObjectKind, RobotPlace, RoomObject
@@ -128,7 +130,9 @@ class TrialRunner:
     def _state(self) -> RoomState:
         report, trouble = self._room.report()
         age_s = None if self._robot is None else time.monotonic() - self._robot[0]
-        return RoomState(report, trouble, self._room.objects, age_s, free_bytes(self._log.path.parent))
+        with write_errors(self._log.path.parent):
+            _, free = free_disk_bytes(self._log.path.parent)
+        return RoomState(report, trouble, self._room.objects, age_s, free)
 
     # ------------------------------------------------------------ the trial
 

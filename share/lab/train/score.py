@@ -13,6 +13,7 @@ from typing import Any
 from share.errors import DataError
 from share.files.json_file import nan_to_none, none_to_nan, parse_json
 from share.files.reading import MAX_SETTINGS_BYTES, read_text
+from share.lab.tables import markdown_table
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,15 @@ class ErrorModelScore:
 
 def score_table(scores: Sequence[ErrorModelScore]) -> str:
     """Return a Markdown table with the paper's columns: errors, and time a keyframe."""
-    head = (
-        "| | RMSE cm | mean error cm | rank correlation | QoE error | in the interval | ms |",
-        "|---|" + 6 * "---|",
-    )
+    head = ["", "RMSE cm", "mean error cm", "rank correlation", "QoE error", "in the interval", "ms"]
     rows = [
-        f"| {s.name} | {s.rmse_cm:.3f} | {s.mae_cm:.3f} | {s.rank:.2f} | {s.qoe_error:.3f} "
-        f"| {_cell(100 * s.coverage, 0, ' %')} | {_cell(s.cpu_ms, 2)} |"
+        [
+            *(s.name, f"{s.rmse_cm:.3f}", f"{s.mae_cm:.3f}", f"{s.rank:.2f}", f"{s.qoe_error:.3f}"),
+            *(_cell(100 * s.coverage, 0, " %"), _cell(s.cpu_ms, 2)),
+        ]
         for s in scores
     ]
-    return "\n".join([*head, *rows])
+    return markdown_table([head, *rows])
 
 
 def scores_json(scores: Sequence[ErrorModelScore]) -> str:
@@ -82,16 +82,14 @@ def model_card(about: Mapping[str, Any], scores: Sequence[ErrorModelScore], size
     """Return the card as Markdown. about: the model's metadata; scores: on the test rooms; size: bytes;
     origin: source and licence of the backbone, empty if unknown."""
     rooms, counts = about["rooms"], about["keyframes"]
-    parts = [f"| {part} | {len(rooms[part])} | {counts[part]} | {', '.join(rooms[part])} |" for part in rooms]
+    parts = [[part, str(len(rooms[part])), str(counts[part]), ", ".join(rooms[part])] for part in rooms]
     return "\n".join(
         [
             "# Error model",
             "",
             f"By SHARE {about['version']}; errors over {about['window_s']:g} s; {size / 1e6:.1f} MB.",
             "",
-            "| part | sessions | keyframes | |",
-            "|---|---|---|---|",
-            *parts,
+            markdown_table([["part", "sessions", "keyframes", ""], *parts]),
             "",
             "On the rooms of *test*:",
             "",

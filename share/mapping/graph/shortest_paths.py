@@ -15,16 +15,16 @@ _REACH_FACTOR = 8.0  # factor on the cost up to which a search goes, until it re
 class ShortestPaths:
     """Shortest paths (Dijkstra 1959) among n poses with E undirected edges: ends a, b (E,), cost (E,).
 
-    An edge is known by its index, by default its position.
+    An edge is known by its index; of the first ones it is their position.
     """
 
-    def __init__(self, n: int, a: I64, b: I64, cost: F64, index: I64 | None = None) -> None:
+    def __init__(self, n: int, a: I64, b: I64, cost: F64) -> None:
         # Edges in both directions, sorted by start:
         self._starts, self._targets = np.zeros(n + 1, np.int32), np.zeros(0, np.int32)
         self._edge_index, self._cost = np.zeros(0, np.int64), np.zeros(0)
         self._removed_count = 0  # removed edges that are still in the arrays, at an infinite cost
         self._last_reach = _MAX_COST
-        self.add(n, a, b, cost, np.arange(len(a)) if index is None else index)
+        self.add(n, a, b, cost, np.arange(len(a)))
 
     def add(self, n: int, a: I64, b: I64, cost: F64, index: I64) -> None:
         """Add edges with these indices. n: number of poses with theirs."""

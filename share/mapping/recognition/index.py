@@ -45,14 +45,14 @@ class PlaceCandidate(NamedTuple):
 class PlaceIndex:
     """Index of keyframes by their descriptors. Ids are any distinct integers.
 
-    tables * 2^bits <= MAX_WORDS; seed: of the choice of each table's bits.
+    seed: of the choice of each table's bits.
     """
 
-    def __init__(self, seed: int = SEED, tables: int = TABLES, bits: int = HASH_BITS) -> None:
+    def __init__(self, seed: int = SEED) -> None:
         rng = np.random.default_rng(seed)
         size = 8 * DESCRIPTOR_BYTES
-        self._sampled_bits = np.stack([rng.choice(size, bits, replace=False) for _ in range(tables)])
-        self._word_counts = np.zeros(tables << bits, np.int32)
+        self._sampled_bits = np.stack([rng.choice(size, HASH_BITS, replace=False) for _ in range(TABLES)])
+        self._word_counts = np.zeros(TABLES << HASH_BITS, np.int32)
         self._pages: list[IndexPage] = []
         self._unpaged: dict[int, U32] = {}  # words of the newest keyframes
         self._merge: Iterator[int] | None = None
@@ -170,22 +170,20 @@ class PlaceIndex:
         self._pages[first : first + count] = [merged] if len(merged) else []
 
     def words(self, descriptors: U8) -> U32:
-        """Words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
-        tables, bits = self._sampled_bits.shape
+        """Words (N * TABLES,) of descriptors (N, 32): table number and sampled bits in one integer."""
         sampled = np.unpackbits(descriptors, axis=1)[:, self._sampled_bits].astype(np.float32)
-        values = sampled @ (2.0 ** np.arange(bits)).astype(np.float32)  # exact up to 24 bits
+        values = sampled @ (2.0 ** np.arange(HASH_BITS)).astype(np.float32)  # exact up to 24 bits
         words: U32 = (
-            values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))
+            values.astype(np.uint32) + (np.arange(TABLES, dtype=np.uint32) << np.uint32(HASH_BITS))
         ).ravel()
         return words
 
 
 U32 = NDArray[np.uint32]
 
-_SLOT_BITS = 13
+_SLOT_BITS = 13  # word and slot are sorted as one uint32: TABLES * 2^HASH_BITS is at most 2^19
 MAX_PAGE_KEYFRAMES = 1 << _SLOT_BITS
 _DROPPED = np.uint16((1 << 16) - 1)  # no slot
-MAX_WORDS = 1 << (32 - _SLOT_BITS)  # word and slot are sorted as one uint32
 _ENTRIES_PER_STEP = 200_000  # of a merge, about
 
 

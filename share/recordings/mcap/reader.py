@@ -29,7 +29,7 @@ from share.recordings.recording import UNBOUNDED_NS, Recording, select_time_rang
 from share.recordings.trajectory import Trajectory, read_tum
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
 from share.sensors.sequencer import rig_streams
-from share.sensors.stamps import WRAP_NS
+from share.sensors.stamps import unwrap_stamps
 from share.types import F64, I64
 
 _IMAGE_TYPES = (ros.IMAGE, ros.COMPRESSED)
@@ -231,9 +231,3 @@ def read_imu(file: MessageFile, progress: Callable[[int, int], None], losses: Da
     if not stamps:
         raise DataError(f"{file.path}: {topic}: has no readable sample")
     return unwrap_stamps(np.concatenate(stamps)), np.concatenate(values)
-
-
-def unwrap_stamps(stamps_ns: I64) -> I64:
-    """Unwrap the stamps (N,) ns of a D4xx: its counter restarts every 71 minutes."""
-    back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < -WRAP_NS // 2
-    return np.asarray(stamps_ns + WRAP_NS * np.cumsum(back), np.int64)

@@ -1,12 +1,11 @@
-"""A part of what measure_emulation.py and measure_paper.py in tools/experiments measure."""
+"""A part of what measure_emulation.py in tools/experiments measures, and plans of the paper's experiments."""
 
-import importlib
 import json
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
+from helpers import paper_plans
+from helpers.experiments import experiment
 
 from share.cli.main import cli
 from share.lab.emulate.recipe import SessionRecipe
@@ -14,24 +13,13 @@ from share.lab.emulate.render.context import missing_reason
 from share.lab.emulate.session import make_session
 
 pytestmark = pytest.mark.slow
-TOOLS = Path(__file__).resolve().parents[3] / "tools" / "experiments"
-
-
-@pytest.fixture(scope="module")
-def tools():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(TOOLS)
-        yield SimpleNamespace(
-            emulation=importlib.import_module("measure_emulation"),
-            paper=importlib.import_module("measure_paper"),
-        )
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("number", range(1, 6))
 @pytest.mark.parametrize("scene", ["warehouse", "firestation"])
-def test_the_papers_experiments_fit_into_every_room(tools, scene, number, seed):
-    row = tools.paper.of_plan(scene, number, seed)
+def test_the_papers_experiments_fit_into_every_room(scene, number, seed):
+    row = paper_plans.of_plan(scene, number, seed)
     assert "failed" not in row, row["failed"]
     assert max(abs(off) for off in row["length_off"]) <= 2.0  # percent
     user1, user2, robot = row["floor_m"]
@@ -42,10 +30,10 @@ def test_the_papers_experiments_fit_into_every_room(tools, scene, number, seed):
 
 @pytest.mark.skipif(missing_reason() is not None, reason=f"cannot draw: {missing_reason()}")
 @pytest.mark.parametrize("motion", ["euroc:euroc/V1_02_medium,start=12", "tumvi:tumvi/room1,start=5"])
-def test_a_real_gyro_turns_as_the_pictures_do(tools, motion, shared_data, tmp_path):
+def test_a_real_gyro_turns_as_the_pictures_do(motion, shared_data, tmp_path):
     kind, _, folder = motion.partition(":")
     recipe = SessionRecipe("warehouse", (f"a={kind}:{shared_data}/motion/{folder}",), seconds=5.0)
-    row = tools.emulation.of_session(str(make_session(recipe, tmp_path / "session") / "a"))
+    row = experiment("measure_emulation").of_session(str(make_session(recipe, tmp_path / "session") / "a"))
     assert row["fit_mm"] < 4.0
     assert row["fit_imu_turn_sigmas"] < 3.0 and row["fit_imu_velocity_sigmas"] < 3.0
     assert row["turn_most_mrad"] > 10  # it does turn

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.observed_simulation import observed_simulation
 
 from share.config import Config
-from share.lab.evaluate.observed_simulation import observed_simulation
 from share.protocol.edge_events import AddKeyframe, AddRun, EdgeEffect, MapperResult
 from share.protocol.peer import RestoredRun
 from share.recordings.session import read_session

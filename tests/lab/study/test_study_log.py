@@ -13,7 +13,7 @@ from helpers.study_folder import begin, goal_events, small_plan
 
 from share.errors import ShareError
 from share.files.json_file import read_json_lines
-from share.lab.study.study_log import StudyLog, free_bytes
+from share.lab.study.study_log import StudyLog
 from share.lab.study.trials import read_trials, trial_folder
 
 PLAN, _ = small_plan()
@@ -95,7 +95,3 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(ShareError, match="cannot be written"):
         StudyLog(tmp_path / "a.jsonl").append({"a": 1})
     assert (tmp_path / "target").read_text() == ""
-
-
-def test_free_space_is_that_of_the_nearest_folder(tmp_path: Path) -> None:
-    assert free_bytes(tmp_path / "not" / "yet") == pytest.approx(free_bytes(tmp_path), rel=0.2)

@@ -19,7 +19,7 @@ from share.errors import DataError, UsageError
 from share.files.yaml_file import read_yaml
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.lab.emulate.types import GRAVITY
+from share.lab.emulate.types import GRAVITY, stamps_within
 from share.lab.mocap.factors import interpolate_samples
 from share.lab.mocap.files import read_mocap
 from share.lab.mocap.fit import MocapFit, fit_mocap
@@ -69,7 +69,7 @@ class RecordedPath:
     def inertial(self, stamps_ns: I64) -> tuple[F64, F64]:
         """Return angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 as recorded less the biases,
         linear between samples, so with the real IMU's noise. Raises ValueError outside the span."""
-        stamps = self._checked_stamps(stamps_ns)
+        stamps = stamps_within(stamps_ns, self.start_ns, self.end_ns)
         gyro, accel = (
             interpolate_samples(self.imu, stamps, self.imu.gyro),
             interpolate_samples(self.imu, stamps, self.imu.accel),
@@ -86,22 +86,13 @@ class RecordedPath:
             raise ValueError("T_world_old: turns about more than the vertical")
         return replace(self, T_world_fit=T_world_old @ self.T_world_fit)
 
-    def _checked_stamps(self, stamps_ns: I64) -> I64:
-        stamps = np.asarray(stamps_ns, np.int64)
-        if len(stamps) and not self.start_ns <= stamps.min() <= stamps.max() <= self.end_ns:
-            raise ValueError(
-                f"stamps {stamps.min()} .. {stamps.max()} ns: "
-                f"the path spans {self.start_ns} .. {self.end_ns} ns"
-            )
-        return stamps
-
     @cached_property
     def _fitted_path(self) -> FittedPath:
         return FittedPath(self.fit, self.imu)
 
     def _pose_and_velocity(self, stamps_ns: I64) -> tuple[F64, F64]:
         """Return T_fit_body (N, 4, 4) and velocity (N, 3) in the fit's world."""
-        return self._fitted_path.pose_and_velocity(self._checked_stamps(stamps_ns))
+        return self._fitted_path.pose_and_velocity(stamps_within(stamps_ns, self.start_ns, self.end_ns))
 
 
 _MARGIN_S = 5.0  # fitted before and after the wanted span: the ends of a batch are the least certain

@@ -65,6 +65,7 @@ def floor_from_occupancy(occupancy: Occupancy) -> Floor:
 Rng = np.random.Generator
 POINT_SPACING_M = 0.05  # between points of a finished route
 _BAND_SPACING_M = 0.1  # between points of a band
+_REACH_M = 0.5  # of smoothing along a route
 _COMFORT_M = 0.35  # m beyond the radius; the cost of a metre rises below this clearance
 _NEIGHBOUR_STEPS = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
 _LEG_RANGE_M = (1.8, 6.0)  # preferred length of a leg
@@ -148,11 +149,11 @@ class FloorGraph:
         return self.places[nodes[::-1]]
 
 
-def smooth_route(floor: Floor, points: F64, radius: float, reach: float = 0.5) -> F64:
-    """Return `points` (N, 2) m resampled and smoothed over about `reach` m, with a clearance of at least
+def smooth_route(floor: Floor, points: F64, radius: float) -> F64:
+    """Return `points` (N, 2) m resampled and smoothed over about half a metre, with a clearance of at least
     `radius` where possible. The ends stay."""
     p = resample(points, _BAND_SPACING_M)
-    for _ in range(round(2 * (reach / _BAND_SPACING_M) ** 2)):
+    for _ in range(round(2 * (_REACH_M / _BAND_SPACING_M) ** 2)):
         p[1:-1] += 0.5 * ((p[:-2] + p[2:]) / 2 - p[1:-1])
         p = _push_from_obstacles(floor, p, radius)
     p = resample(p, POINT_SPACING_M)

@@ -23,7 +23,7 @@ import numpy as np
 
 from share.errors import DataError, UsageError
 from share.geometry import se3
-from share.lab.emulate.types import GRAVITY
+from share.lab.emulate.types import GRAVITY, stamps_within
 from share.recordings.trajectory import Trajectory, read_tum
 from share.types import F64, I64
 
@@ -82,13 +82,7 @@ class SplinePath:
         )
 
     def _seconds(self, stamps_ns: I64) -> F64:
-        stamps = np.asarray(stamps_ns, np.int64)
-        if len(stamps) and not self.start_ns <= stamps.min() <= stamps.max() <= self.end_ns:
-            raise ValueError(
-                f"stamps {stamps.min()} .. {stamps.max()} ns: "
-                f"the path spans {self.start_ns} .. {self.end_ns} ns"
-            )
-        return (stamps - self.start_ns) / 1e9
+        return (stamps_within(stamps_ns, self.start_ns, self.end_ns) - self.start_ns) / 1e9
 
 
 def spline_through(start_ns: int, seconds: F64, p: F64, q: F64) -> SplinePath:

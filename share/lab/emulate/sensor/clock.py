@@ -134,11 +134,3 @@ def stamp_jitter_ns(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> 
         return np.zeros(len(index), np.int64)
     limit = min(3 * sigma_ns, _MAX_JITTER_SHARE * 1e9 / rate_hz)
     return np.rint(np.clip(normal(seed, index) * sigma_ns, -limit, limit)).astype(np.int64)
-
-
-def unwrapped_stamps(stamps_ns: I64, period_ns: int) -> I64:
-    """Return ordered stamps (N,) of one stream without the wraps of its counter."""
-    if not period_ns:
-        return stamps_ns
-    wraps = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[:1]) < -period_ns // 2)
-    return stamps_ns + period_ns * wraps

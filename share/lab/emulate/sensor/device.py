@@ -26,6 +26,7 @@ from share.lab.emulate.sensor.imu import (
 )
 from share.lab.emulate.types import MotionPath
 from share.sensors.profile_types import InertialFacts, Profile
+from share.sensors.stamps import unwrap_stamps
 from share.types import F32, F64, I64, U8
 
 _MAX_EXPOSURE_SHARE = 0.9  # longest exposure, as a share of the frame period
@@ -105,9 +106,7 @@ class EmulatedDevice:
         stamp_error = pictures.stamp_ns - self.clock.read(pictures.true_ns)
         if period := self.clock.period_ns:
             stamp_error = (stamp_error + period // 2) % period - period // 2
-        return pictures.true_ns + stamp_error, clocks.unwrapped_stamps(
-            pictures.stamp_ns, self.clock.period_ns
-        )
+        return pictures.true_ns + stamp_error, unwrap_stamps(pictures.stamp_ns, self.clock.period_ns)
 
     def lamp_light(self, true_ns: I64) -> F64:
         """Return the light of the room's lamps (N,) at true times (N,), relative to the room's nominal

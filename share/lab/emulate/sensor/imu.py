@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.lab.emulate.sensor.clock import Seed, unwrapped_stamps
+from share.lab.emulate.sensor.clock import Seed
 from share.sensors.profile_types import InertialFacts
+from share.sensors.stamps import unwrap_stamps
 from share.types import F64, I64, ImuBatch
 
 
@@ -45,7 +46,7 @@ class ImuStreams:
     def _unwrapped(self) -> tuple[I64, I64]:
         """Return stamps of both streams without wraps."""
         gyro_ns, accel_ns = (
-            unwrapped_stamps(stamps, self.period_ns) for stamps in (self.gyro_ns, self.accel_ns)
+            unwrap_stamps(stamps, self.period_ns) for stamps in (self.gyro_ns, self.accel_ns)
         )
         if self.period_ns:  # both start within a period of the slower one: nearer than half a wrap
             accel_ns = accel_ns + self.period_ns * round((gyro_ns[0] - accel_ns[0]) / self.period_ns)

@@ -27,15 +27,13 @@ def _random_text(rng: Rng, count: int) -> str:
     return "".join(rng.choice(_LETTERS, count))
 
 
-def _write_text(
-    rng: Rng, sheet: U8, text: str, box: tuple[int, int, int, int], gray: float, stroke: float = 0.09
-) -> None:
+def _write_text(rng: Rng, sheet: U8, text: str, box: tuple[int, int, int, int], gray: float) -> None:
     """Write `text` into the box (x, y, width, height) in texels, as large as it fits."""
     x, y, w, h = box
     font = int(_FONTS[int(rng.integers(len(_FONTS)))])
     (tw, th), _ = cv2.getTextSize(text, font, 1.0, 1)
     scale = 0.92 * min(w / tw, h / th)
-    thick = max(1, round(stroke * th * scale))
+    thick = max(1, round(0.09 * th * scale))
     at = (x + round((w - tw * scale) / 2), y + round((h + th * scale) / 2))
     cv2.putText(sheet, text, at, font, scale, gray, thick, cv2.LINE_AA)
 

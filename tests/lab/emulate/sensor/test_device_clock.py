@@ -8,8 +8,8 @@ from share.lab.emulate.sensor.clock import (
     normal,
     stamp_jitter_ns,
     uniform,
-    unwrapped_stamps,
 )
+from share.sensors.stamps import unwrap_stamps
 
 
 def test_a_stream_keeps_its_rate_and_is_the_same_in_every_span():
@@ -33,7 +33,7 @@ def test_the_clock_gains_its_drift_and_wraps_at_32_bits_of_microseconds():
     assert (shown % 1000 == 0).all()
     wrapped = DeviceClock(10**18, 5_000_000, 20.0, 1000, 32).read(true)
     assert (wrapped < 2**32 * 1000).all() and (np.diff(wrapped) < 0).sum() in (2, 3)
-    counted = unwrapped_stamps(wrapped, 2**32 * 1000)
+    counted = unwrap_stamps(wrapped, 2**32 * 1000)
     assert np.array_equal(np.diff(counted), np.diff(shown))
 
 

@@ -22,9 +22,9 @@ def _frame(rng: Rng, width: float, low: float, high: float, skin: Material, bar:
     return out
 
 
-def _door_leaf(rng: Rng, width: float, low: float, high: float, kind: str, y: float = -0.02) -> Shape:
+def _door_leaf(rng: Rng, width: float, low: float, high: float, kind: str) -> Shape:
     skin, cell = pick_print(rng, kind)
-    return quad((-width / 2, y, low), (width, 0, 0), (0, 0, high - low), skin, rng, cell)
+    return quad((-width / 2, -0.02, low), (width, 0, 0), (0, 0, high - low), skin, rng, cell)
 
 
 def door(rng: Rng) -> Shape:

@@ -180,9 +180,9 @@ def _paper_sheet(rng: Rng, x: float, y: float) -> Shape:
     return decal((x, y, 0), (0.21, 0, 0), (0, 0.297, 0), skin, rng, cell)
 
 
-def table(rng: Rng, width: float, depth: float = 0.8) -> Shape:
+def table(rng: Rng, width: float) -> Shape:
     """A plain table of 0.74 m with small objects on it."""
-    top = 0.74
+    depth, top = 0.8, 0.74
     out = [
         corner_posts(width, depth, top - 0.03, 0.05, pick_material(rng, "steel"), rng),
         box((-width / 2, -depth, top - 0.03), (width / 2, 0, top), pick_material(rng, "wood"), rng),
@@ -219,9 +219,9 @@ def chair(rng: Rng) -> Shape:
 # Fire hoses and extinguishers.
 
 
-def rolled_hose(rng: Rng, radius: float, wide: float = 0.075) -> Shape:
+def rolled_hose(rng: Rng, radius: float) -> Shape:
     """A rolled hose standing on its edge, its coupling in the middle; the roll's axis along y."""
-    skin, metal = pick_material(rng, "hose"), pick_material(rng, "galvanised")
+    wide, skin, metal = 0.075, pick_material(rng, "hose"), pick_material(rng, "galvanised")
     out = [cylinder((0, -wide, radius), radius, wide, skin, skin, axis="y", sides=20, rng=rng)]
     out.append(cylinder((0, -wide - 0.02, radius), 0.035, 0.02, metal, metal, axis="y", sides=10, rng=rng))
     rings = np.arange(0.06, radius - 0.01, 0.045)

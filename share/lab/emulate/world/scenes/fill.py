@@ -14,7 +14,7 @@ from share.lab.emulate.world.scenes.layout_builder import LayoutBuilder, Wall
 
 ShapeMaker = Callable[[Rng], Shape]
 
-_SEARCH_STEP_M = 0.1  # step of the search for a free place
+_SEARCH_M, _SEARCH_STEP_M = 1.0, 0.1  # search for a free place
 
 
 def choose_weighted(rng: Rng, weights: Mapping[str, float]) -> str:
@@ -28,25 +28,22 @@ def furnish_wall(
     wall: Wall,
     makers: Mapping[str, tuple[float, ShapeMaker]],
     gaps: tuple[float, float],
-    end_share: float = 1.0,
 ) -> None:
-    """Place furniture with its back to a wall, from left to right, with gaps (low, high) m between, up to a
-    share `end_share` of the wall. makers: by name, weight and function."""
+    """Place furniture with its back to a wall, from left to right, with gaps (low, high) m between.
+    makers: by name, weight and function."""
     rng, weights = plan.rng, {name: weight for name, (weight, _) in makers.items()}
     position = rng.uniform(*gaps)
-    while position < end_share * wall.length - 0.3:
+    while position < wall.length - 0.3:
         name = choose_weighted(rng, weights)
         width = place_on_wall(plan, wall, name, makers[name][1](rng), position)
         position += width + rng.uniform(*gaps) if width else 0.3
 
 
-def place_on_wall(
-    plan: LayoutBuilder, wall: Wall, name: str, shape: Shape, left: float, search_m: float = 1.0
-) -> float:
-    """Place a shape at the first free place at or after `left` m, within `search_m`; return how far it
+def place_on_wall(plan: LayoutBuilder, wall: Wall, name: str, shape: Shape, left: float) -> float:
+    """Place a shape at the first free place at or after `left` m, within a metre; return how far it
     reaches from `left`, or 0 if there was none."""
     wide = float(shape.bounding_box[1, 0] - shape.bounding_box[0, 0])
-    for shift in np.arange(0, search_m, _SEARCH_STEP_M):
+    for shift in np.arange(0, _SEARCH_M, _SEARCH_STEP_M):
         if left + shift + wide > wall.length:
             return 0.0
         middle = left + shift - float(shape.bounding_box[0, 0])
@@ -172,12 +169,10 @@ def paint_line(
     plan.add_unchecked("line", shape)
 
 
-def paint_rectangle(
-    plan: LayoutBuilder, low: tuple[float, float], high: tuple[float, float], line_width: float = 0.08
-) -> None:
+def paint_rectangle(plan: LayoutBuilder, low: tuple[float, float], high: tuple[float, float]) -> None:
     """A rectangle of painted lines."""
     (x0, y0), (x1, y1) = low, high
     for y in (y0, y1):
-        paint_line(plan, (x0, y), (x1, y), line_width)
+        paint_line(plan, (x0, y), (x1, y))
     for x in (x0, x1):
-        paint_line(plan, (x, y0), (x, y1), line_width)
+        paint_line(plan, (x, y0), (x, y1))

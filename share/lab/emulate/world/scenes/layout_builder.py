@@ -32,10 +32,9 @@ class Wall:
     length: float
     height: float
 
-    def place(self, shape: Shape, position: float, z: float = 0.0, distance: float = 0.0) -> Shape:
-        """Return `shape` with its middle `position` m along the wall, `z` m up and its back `distance` m off
-        it."""
-        return shape.placed_at(*self.point_before(position, distance), z, self.yaw)
+    def place(self, shape: Shape, position: float, z: float = 0.0) -> Shape:
+        """Return `shape` with its back to the wall, its middle `position` m along it, `z` m up."""
+        return shape.placed_at(*self.point_before(position, 0.0), z, self.yaw)
 
     def point_before(self, position: float, distance: float) -> tuple[float, float]:
         """Return the place (x, y) m, `position` m along the wall and `distance` m off it."""

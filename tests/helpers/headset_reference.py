@@ -1,8 +1,9 @@
-"""Where a headset's own space is in the shared map: T_map_local from pairs of poses of one head.
+"""References in Python of the headset page's mathematics: alignment of a headset's space, and prediction.
 
-A Kalman filter over pairs at one moment: the device's pose in the map, through the mount, and the viewer's
-pose in the headset's space. Both drift, so the alignment does: a random walk at the wearer, where it is seen;
-the lever arm would exaggerate a walk at either origin.
+Where a headset's own space is in the shared map: T_map_local from pairs of poses of one head, by a Kalman
+filter over pairs at one moment: the device's pose in the map, through the mount, and the viewer's pose in the
+headset's space. Both drift, so the alignment does: a random walk at the wearer, where it is seen; the lever
+arm would exaggerate a walk at either origin.
 """
 
 from __future__ import annotations
@@ -123,3 +124,16 @@ class SpaceAlignment:
         """Return the covariance (6, 6) of a pair, at the viewer."""
         to_viewer = se3.adjoint(se3.inverse(self.T_body_viewer))
         return np.asarray(to_viewer @ pair.cov @ to_viewer.T + np.diag(_TREMBLE**2), np.float64)
+
+
+MAX_AHEAD_S = 0.1  # beyond, a head has turned otherwise
+
+
+def predict_pose(T_world_body: F64, velocity: F64, angular_velocity: F64, ahead_s: float) -> F64:
+    """Return T_world_body (4, 4) `ahead_s` later, at most MAX_AHEAD_S.
+
+    velocity (3,) m/s along the world's axes, angular_velocity (3,) rad/s about the body's.
+    """
+    ahead_s = min(max(ahead_s, 0.0), MAX_AHEAD_S)
+    R = T_world_body[:3, :3] @ se3.so3_exp(np.asarray(angular_velocity) * ahead_s)
+    return se3.from_rt(R, T_world_body[:3, 3] + np.asarray(velocity) * ahead_s)

@@ -1,96 +1,43 @@
-"""Policies in virtual time: real state machines of agents, edge and mapper, with durations drawn from
-samples.
+"""A room played in virtual time with modelled mapping: what each camera sees, and the errors of its agents.
 
-    python tools/experiments/simulate.py [--policies covins-g share] [--link wifi5] [--seeds 0:3] \\
-        [--set control.attribution=true]
-
-Two headsets and a robot, a minute in an emulated warehouse (keyframes as in measure_load.py, odometry that
-drifts, frames at 30 Hz, evaluations with the true error). Prints a Markdown table: means over seeds of
-latency (as in docs/do/evaluate.md) and its parts, keyframes sent, merges, and the error of agents' poses in
-the map that they share, cm rms, causal, one alignment of a map for all.
+Keyframes as in measure_load.py, odometry that drifts, frames at 30 Hz, evaluations with the true error.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-import time
-from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
-from share import startup
+import numpy as np
+from keyframe_set import AgentKeyframes, KeyframeSet
+from modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel
 
-startup.prepare_process()
-
-import numpy as np  # noqa: E402
-from keyframe_set import AgentKeyframes, KeyframeSet  # noqa: E402
-from load_tracks import room  # noqa: E402
-from measure_joins import configured  # noqa: E402
-from modelled_mapper import GroundTruth, ModelledMapper, RecognitionModel  # noqa: E402
-from tool_main import exit_code, line  # noqa: E402
-
-from share.config import NEAR_M, POLICY_NAMES, STREAMED, Config  # noqa: E402
-from share.geometry.interpolation import Trajectory  # noqa: E402
-from share.geometry.se3 import transform, umeyama  # noqa: E402
-from share.lab.evaluate.emulated_network import LinkAssignment  # noqa: E402
-from share.lab.evaluate.processing_delays import ProcessingDelays  # noqa: E402
-from share.lab.evaluate.simulation import Simulation, TrackedFrame  # noqa: E402
-from share.metrics.frame_log import summary as summarised  # noqa: E402
-from share.metrics.local_error import LocalError  # noqa: E402
-from share.protocol.agent_events import LocalisedPose  # noqa: E402
-from share.types import F64, I64, OdometryKeyframe  # noqa: E402
+from share.config import NEAR_M, POLICY_NAMES, STREAMED, Config
+from share.geometry.interpolation import Trajectory
+from share.geometry.se3 import transform, umeyama
+from share.lab.evaluate.emulated_network import LinkAssignment
+from share.lab.evaluate.processing_delays import ProcessingDelays
+from share.lab.evaluate.simulation import Simulation, TrackedFrame
+from share.metrics.frame_log import summary as summarised
+from share.metrics.local_error import LocalError
+from share.protocol.agent_events import LocalisedPose
+from share.types import F64, I64, OdometryKeyframe
 
 # others have agents that send raw frames
 SIMULATED = [policy for policy in POLICY_NAMES if policy != STREAMED]
 FRAME_NS = 33_333_333
-HEAD = ("policy", "agent", "latency ms", "frames ms", "corrected ms", "n", "sent", "rate, Hz", "QoE", "cm")
 
 Row = dict[str, Any]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--policies", nargs="*", choices=SIMULATED, default=["covins-g", "share"])
-    parser.add_argument("--link", default="wifi5")
-    parser.add_argument("--seeds", default="0:3", metavar="FIRST:END")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    return exit_code("simulate", lambda: simulate(options))
-
-
-def simulate(options: argparse.Namespace) -> None:
-    """Run every policy, seed by seed."""
-    config, made = configured(options.set), room()
-    first, end = map(int, options.seeds.split(":"))
-    rows = []
-    print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
-    for policy in options.policies:
-        chosen = replace(config, edge=replace(config.edge, policy=policy))
-        runs = [play(made, chosen, options.link, seed) for seed in range(first, end)]
-        rows += runs
-        for name in runs[0]["agents"]:
-            print(line(cells_of(policy, name, [run["agents"][name] for run in runs])))
-        print(summary(policy, runs), flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n")
-
-
-def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool = False) -> Row:
-    """Simulate one run. modelled: with a mapper that knows the true poses and needs no views. busy, solving:
-    of the edge's mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
-    began = time.monotonic()
+def play(made: KeyframeSet, config: Config, link: str, seed: int) -> Row:
+    """Simulate one run, with a mapper that knows the true poses and needs no views. busy, solving: of the
+    edge's mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
     who = list(made.agents.values())
     seen, truth, seconds = frames_of_all(made, seed)
-    mapper = None
-    if modelled:
-        known = truth_of(made, NEAR_M, config.control.far_m)
-        mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
+    known = truth_of(made, NEAR_M, config.control.far_m)
+    mapper = ModelledMapper(config, known, which(truth), RecognitionModel(), seed)
     links = LinkAssignment.parse(link)
     links.check(made.agents, virtual=True)
     networks = [links.network_for(agent.hello.name) for agent in who]
@@ -115,18 +62,15 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
     for name, row in agents.items():
         row["error_cm"] = errors_cm.get(name, float("nan"))
     metres = sum(float(np.linalg.norm(np.diff(a.T_world_body[:, :3, 3], axis=0), axis=1).sum()) for a in who)
-    joined = max(Counter(own["map_id"] for own in report["agents"].values()).values())
     corrected_ms = np.concatenate([log.frames().corrected_ms for log in world.logs.values()])
     late_ms = corrected_ms[corrected_ms > 0]
     whole = {
         "metres": metres,
-        "joined": joined,
         "maps": len({own["map_id"] for own in report["agents"].values()}),
         "corrected_ms": summarised(late_ms).report(),
         "busy": world.mapper_busy_ns / world.now_ns,
         "solving": world.solver_busy_ns / world.now_ns,
         "passed_over": sum(own["queries_skipped"] for own in report["agents"].values()),
-        "took_s": time.monotonic() - began,
     }
     return {"policy": config.edge.policy, "seed": seed, "agents": agents, **report["merges"], **whole}
 
@@ -211,35 +155,5 @@ def shared_errors(placed: dict[str, list[LocalisedPose]], truth: dict[str, Traje
     return {name: 100 * float(np.sqrt(np.mean(squares))) for name, squares in square.items() if squares}
 
 
-def summary(policy: str, runs: list[Row]) -> str:
-    names = ("requested", "skipped", "done", "metres", "joined", "took_s")
-    means = {name: mean([run[name] for run in runs]) for name in names}
-    agents = len(runs[0]["agents"])
-    return (
-        f"{policy}: merges requested {means['requested']:.0f}, skipped {means['skipped']:.0f}, done "
-        f"{means['done']:.0f} ({means['done'] / means['metres']:.2f} a metre); "
-        f"{means['joined']:.1f} of {agents} in one map; {means['took_s']:.0f} s a run"
-    )
-
-
-def cells_of(policy: str, name: str, runs: list[Row]) -> list[str]:
-    figures = {key: mean([run[key] for run in runs]) for key in runs[0] if key != "rate_hz"}
-    rates = [run["rate_hz"] for run in runs if run["rate_hz"] is not None]
-    return [
-        policy,
-        name,
-        *(f"{figures[key]:.1f}" for key in ("latency_ms", "track_ms", "corrected_ms")),
-        f"{figures['corrected']:.0f}",
-        f"{figures['sent']:.0f}",
-        f"{mean(rates):.1f}" if rates else "–",
-        f"{figures['qoe']:.2f}",
-        f"{figures['error_cm']:.2f}",
-    ]
-
-
 def mean(values: Any) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
