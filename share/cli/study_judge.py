@@ -82,7 +82,7 @@ def judge(
     kept = path.with_name(EVENTS_BY_MAP)
     newest = read_trial(path, plan, *planned)
     is_judged = newest.judge == "mocap" and kept.exists()
-    if newest.judge == "map" and kept.exists() and kept.read_bytes() != path.read_bytes():
+    if newest.judge == "map" and kept.exists() and _lines(kept) != _lines(path):
         raise UsageError(f"{kept}: is of another trial than {EVENTS}; move it away")
     source = kept if is_judged else path
     before = read_trial(source, plan, *planned) if is_judged else newest
@@ -109,7 +109,7 @@ def judge(
             "take, and are --floor, --up and --body right? If the map was so wrong, give --zero"
         )
     if not kept.exists():
-        atomic_write(kept, path.read_bytes())
+        atomic_write(kept, _lines(path))
     atomic_write(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
     if zero is None:
         when = datetime.fromtimestamp(clock.zero_utc_s, UTC).isoformat(timespec="milliseconds")[:-6]
@@ -119,6 +119,14 @@ def judge(
         )
     _print_goals(before, read_trial(path, plan, *planned), plan, lines)
     click.echo(f"{path}: judged by motion capture; what the map said: {kept}")
+
+
+def _lines(path: Path) -> bytes:
+    from share.files.reading import read_bytes, read_errors
+    from share.lab.study.trials import MAX_LINES_BYTES
+
+    with read_errors(path):
+        return read_bytes(path, MAX_LINES_BYTES)
 
 
 def _planned_trial(folder: Path, plan: StudyPlan, trial: str) -> tuple[tuple[str, int, str], Path]:

@@ -324,10 +324,10 @@ CONFIGS = {
     "a list": ("- tracker", "config.yaml: expected keys and values, found list"),
     "unknown section": ("traker: {}", "config.yaml: unknown key 'traker'; did you mean 'tracker'?"),
     "unknown key": ("tracker: {cornrs: 9}", "tracker: unknown key 'cornrs'; did you mean 'corners'?"),
-    "far from any": ("tracker: {zzz: 9}", "tracker: unknown key 'zzz'; known: corners, "),
+    "far from any": ("agent: {zzz: 9}", "agent: unknown key 'zzz'; known: keep_keyframes, "),
     "wrong type": ("tracker: {corners: many}", "tracker: corners: expected a whole number, found 'many'"),
     "a number": ("tracker: 5", "tracker: expected keys and values, found int"),
-    "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
+    "out of range": ("stream: {window: 0}", "stream: window: 0 must be positive"),
     "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
     "negative": (
         "inertial: {max_speed_m_s: -1}",
