@@ -89,7 +89,7 @@ def test_a_running_edge_answers(share: Share, edge: str, tmp_path: Path) -> None
 def test_an_absent_edge_fails_in_one_line(
     share: Share, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor.probe_edge, "__defaults__", (0.3,))
+    monkeypatch.setattr(doctor, "_EDGE_TIMEOUT_S", 0.3)
     done = share("doctor", *LAPTOP, "--edge", "tcp://127.0.0.1:1", "--keys", tmp_path / "none")
     assert done.code == 1
     assert done.err == "share: doctor: 1 check failed: edge\n"
