@@ -28,9 +28,10 @@ WORKERS := $(shell expr 1 + $$(nproc))# one more than cores: many tests wait for
 unit: install  # the inner loop: what decides, without what takes a second or more
 	$(BIN)/pytest -n auto --maxprocesses 4 -m "not slow and not torture and not long" tests/geometry tests/vision tests/scheduling tests/metrics tests/wire tests/sensors tests/protocol tests/mapping tests/odometry
 test: install
-	$(BIN)/pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --ignore tests/run
-	$(BIN)/pytest -n $(WORKERS) --maxprocesses 3 --dist loadfile tests/run $(BUSY:%=--ignore %)  # real time: mostly waiting
+	$(BIN)/pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile $(REAL_TIME:%=--ignore %)
+	$(BIN)/pytest -n $(WORKERS) --maxprocesses 3 --dist loadfile $(REAL_TIME) $(BUSY:%=--ignore %)  # mostly waiting
 	$(BIN)/pytest $(BUSY)  # with the cores to themselves
+REAL_TIME := tests/run tests/net/test_transport_attacks.py
 BUSY := tests/run/test_kitchen.py tests/run/test_streamed.py# their processes fill two cores
 SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial tests/torture  # in real time, or with their own processes
 slow: install
