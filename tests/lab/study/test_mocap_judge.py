@@ -343,6 +343,17 @@ def test_a_clock_that_was_set_in_between_is_said(tmp_path: Path, utc: str) -> No
     assert "the clock of the machine that led the trial was set in between" in str(result.exception)
 
 
+def test_a_standstill_may_be_written_after_what_came_later(tmp_path: Path) -> None:
+    """It is known a second after it began; the navigator's word may come before."""
+    events = events_by_map(1, 0.0)
+    last = next(k for k, one in reversed([*enumerate(events)]) if one["event"] == "stands")
+    stands = events.pop(last)
+    events.insert(last + 1, stands)  # after the status, which is later
+    folder = study_with(tmp_path / "study", events)
+    zero = datetime.fromtimestamp(BEGAN_S - OFFSET_S, UTC).isoformat()
+    assert judge(folder, write_tum(tmp_path / "take.tum", mocap_of(1)), "--zero", zero).exit_code == 0
+
+
 def test_trials_that_were_left_are_no_change_of_judge(tmp_path: Path) -> None:
     folder = study_with(tmp_path / "study", events_by_map(1, 0.0))
     left = begin(PLAN, P01, 2, judge="map")
