@@ -14,6 +14,7 @@ that of a map that has changed:
     map_solving          the job of the solver (`graph`), and what its solution changes
     map_gauge            what of that is shown: no motion of the whole map that is uncertain
     localisation_gate    is an agent's place known well enough to publish a correction?
+    settling             who enters another map aligns a few keyframes in it before that
     corrections          which agents get one
 
 `atlas.Atlas` holds all of it, each keyframe's pose in `pose_table`. Slow work is yielded as `steps`, which

@@ -173,6 +173,7 @@ class Atlas:
         node_id = self.graph.add_keyframe(agent, keyframe, cov, make_gravity_factor(keyframe), rank)
         self.quarantine.add_step(node_id, keyframe.T_ref_body, cov)
         self.graph.add_spans(node_id, keyframe)
+        self.solving.add_keyframe(node_id)
         return node_id
 
     def restore(self, kept: StoredMap, ranks: Sequence[int]) -> list[int]:

@@ -16,9 +16,11 @@ from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_gauge import MapGauge, SolvedPlace
 from share.mapping.map_graph import MapGraph
 from share.mapping.segments import AgentRuns
+from share.mapping.settling import Settling
 from share.types import F64, Correction
 
 _OUTLIER_CHI2 = 1000.0  # loops with a larger chi-squared after a solution are dropped
+_PLACE_KEYFRAMES = 40  # newest ones of a segment, whose loops say where it is
 _MIN_STEP_VARIANCE = 1e-8  # m^2, below the floor of any step
 
 
@@ -43,7 +45,8 @@ class SolveJob:
 
     is_reset: `change` is the whole graph, and the solver has to forget what it knew. segments: of the map,
     each with its newest node. covariance_segments: those whose newest node needs a covariance. answered_ids:
-    newest keyframe of each agent that this solution answers.
+    newest keyframe of each agent that this solution answers. places: of segments that are not shown this map
+    yet, a keyframe that is, and their newest one.
     """
 
     map_id: str
@@ -54,6 +57,7 @@ class SolveJob:
     change: GraphUpdate
     is_reset: bool
     answered_ids: tuple[tuple[str, int], ...]
+    places: tuple[tuple[int, int], ...] = ()
 
     @property
     def covariance_nodes(self) -> tuple[int, ...]:
@@ -77,12 +81,19 @@ class MapSolving:
     ) -> None:
         self._graph, self._loop_acceptance = graph, loop_acceptance
         self._localisation_gate, self._runs = localisation_gate, runs
-        self._gauge = MapGauge()
+        self._gauge, self._settling = MapGauge(), Settling()
         self._answered_ids: dict[str, int] = {}  # newest keyframe of each agent with a loop not solved yet
 
     def mark_answered(self, key: KeyframeKey) -> None:
         """A loop from this keyframe was accepted; the next solution of its map answers it."""
         self._answered_ids[key.agent] = max(key.id, self._answered_ids.get(key.agent, -1))
+
+    def add_keyframe(self, node_id: int) -> None:
+        """Solve the map of an agent that settles in it once more."""
+        segment = self._graph.odometry.nodes[node_id].segment
+        reference_segment = self._graph.reference_segments[segment]
+        if self._settling.is_settling(segment, reference_segment):
+            self._graph.unsolved_maps.setdefault(reference_segment)
 
     def remove_run(self, agent: str) -> None:
         self._answered_ids.pop(agent, None)
@@ -90,6 +101,7 @@ class MapSolving:
     def forget_all_but(self, segments: Collection[int]) -> None:
         """Forget what was shown to all but these segments: the others have no keyframes."""
         self._gauge.forget_all_but(segments)
+        self._settling.forget_all_but(segments)
 
     def schedule_unpublished(self, agent: str) -> None:
         """Solve the map of a run that reconnected, unless its pose there was published."""
@@ -118,17 +130,19 @@ class MapSolving:
         agents = {graph.odometry.segments[s].agent for s in segments}
         graph.unsolved_maps.pop(reference_segment, None)
         is_reset = graph.edges.is_reset
+        covariance_segments = self._segments_wanting_covariance(reference_segment, segments)
         return SolveJob(
             map_id,
             segments,
             graph.anchor(reference_segment),
             tuple(graph.odometry.segments[s].nodes[-1] for s in segments),
-            self._segments_wanting_covariance(reference_segment, segments),
+            covariance_segments,
             graph.edges.take_update(graph.poses, graph.gravity_factors),
             is_reset,
             tuple(
                 (agent, self._answered_ids.pop(agent)) for agent in sorted(agents & self._answered_ids.keys())
             ),
+            self._places(reference_segment, covariance_segments),
         )
 
     def _segments_wanting_covariance(
@@ -151,6 +165,32 @@ class MapSolving:
                 or self._localisation_gate.published_cov(s, reference_segment) is None
             )
         )
+
+    def _places(self, reference_segment: int, segments: Sequence[int]) -> tuple[tuple[int, int], ...]:
+        """Pairs of a keyframe that agents are shown in this map, and the newest one of a segment that is not
+        shown it: of those that loops connect it with, the one from which it is known best."""
+        graph, gate = self._graph, self._localisation_gate
+        out: list[tuple[int, int]] = []
+        for segment in segments:
+            if segment == reference_segment or gate.is_published(segment, reference_segment):
+                continue
+            nodes = graph.odometry.segments[segment].nodes
+            shown = [
+                n
+                for n in self._loop_partners(nodes[-_PLACE_KEYFRAMES:])
+                if (other := graph.odometry.nodes[n].segment) == reference_segment
+                or gate.is_published(other, reference_segment)
+            ]
+            if shown:
+                covs = graph.relative_estimates(nodes[-1], shown).cov
+                out.append((shown[int(np.argmin([sigma_ahead(cov) for cov in covs]))], nodes[-1]))
+        return tuple(out)
+
+    def _loop_partners(self, node_ids: Sequence[int]) -> list[int]:
+        """Nodes with which these have loops."""
+        edges = self._graph.edges
+        loops = (edges.by_id[n] for node in node_ids for n in edges.incident(node) if n in edges.loops)
+        return sorted({end for edge in loops for end in (edge.a, edge.b)}.difference(node_ids))
 
     def apply(self, job: SolveJob, solution: GraphSolution) -> AppliedSolution:
         """Apply a solution; keyframes and loops that arrived meanwhile are kept.
@@ -196,11 +236,13 @@ class MapSolving:
         """Pass the new covariances to the localisation gate. Return the sigma (m) of agents that wait."""
         odometry, nodes = self._graph.odometry, self._graph.odometry.nodes
         covariances = dict(zip(job.covariance_nodes, solution.covariances, strict=True))
+        of_places = zip(job.places, solution.pair_covariances, strict=True)
+        place_covs = {last: cov for (_, last), cov in of_places}
         answered_ids = dict(job.answered_ids)
         uncertainties = {
             segment: PlacementUncertainty(
                 se3.inverse_cov(nodes[last].T_odom_body, covariances[last]),
-                sigma_ahead(covariances[last]),
+                sigma_ahead(place_covs.get(last, covariances[last])),
                 answered_ids.get(odometry.segments[segment].agent),
                 odometry.segments[segment].is_worn,
             )
@@ -209,11 +251,17 @@ class MapSolving:
         }
         self._localisation_gate.forget_waits(self._graph.split_segments)
         self._graph.split_segments.clear()
-        waiting = self._localisation_gate.update(job.segments[0], job.segments, uncertainties)
+        gate, reference_segment = self._localisation_gate, job.segments[0]
+        outside = [s for s in uncertainties if not gate.is_published(s, reference_segment)]
+        waiting = gate.update(reference_segment, job.segments, uncertainties)
+        newest_nodes = dict(zip(job.segments, job.newest_nodes, strict=True))
+        for s in outside:
+            if s != reference_segment and gate.is_published(s, reference_segment):
+                self._settling.begin(s, reference_segment, nodes[newest_nodes[s]].ordinal)
         return {odometry.segments[s].agent: sigma_m for s, sigma_m in waiting.items()}
 
     def _corrections(self, job: SolveJob) -> tuple[dict[str, Correction], dict[str, str]]:
-        """Corrections of the agents that passed the gate, and why those of others are invalid.
+        """Corrections of the agents that passed the gate and settled, and why those of others are invalid.
 
         Keyframes newer than the solution follow the newest solved one rigidly.
         """
@@ -222,7 +270,9 @@ class MapSolving:
         for segment, last in zip(job.segments, job.newest_nodes, strict=True):
             cov = self._localisation_gate.published_cov(segment, job.segments[0])
             is_current = odometry.current_segment(odometry.segments[segment].agent) == segment
-            if cov is not None and is_current and last in odometry.nodes:
+            if cov is None or not is_current or last not in odometry.nodes:
+                continue
+            if not self._settling.continues(segment, job.segments[0], odometry.nodes[last].ordinal):
                 passed[segment] = last, cov
         shown = self._gauge.show(job.segments[0], self._solved_places(passed))
         out: dict[str, Correction] = {}

@@ -122,7 +122,7 @@ class SolveStep:
         if self.job.is_reset:
             solver.clear()
         solver.update(self.job.change)
-        return solver.solve(self.job.anchor, self.job.covariance_nodes)
+        return solver.solve(self.job.anchor, self.job.covariance_nodes, self.job.places)
 
 
 LookupStep = DescribeStep | IndexStep | QueryStep | VerifyStep | AlignStep

@@ -13,6 +13,8 @@ from share.mapping.loop_consistency import LoopEvidence
 from share.mapping.loops import KeyframeKey, Loop
 from share.types import F64
 
+pytestmark = pytest.mark.usefixtures("entered_at_once")
+
 CONFIG = MergeConfig(join_places=5, enter_m=0.2)  # the loops of walkers are no surer
 WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 

@@ -13,6 +13,8 @@ from share.mapping.localisation_gate import AHEAD_M
 from share.mapping.map_gauge import MapGauge, SolvedPlace
 from share.types import F64
 
+pytestmark = pytest.mark.usefixtures("entered_at_once")
+
 ANN, BOB, ROBOT = range(3)  # segments; the map is ann's
 BODIES = {ANN: np.array([0.0, 0, 1.5]), BOB: np.array([4.0, 0, 1.5]), ROBOT: np.array([2.0, 3, 0.2])}
 

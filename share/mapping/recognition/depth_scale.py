@@ -76,6 +76,17 @@ def relative_depth_scale(
     return DepthScale(log_scale, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance)), pose_sensitivity)
 
 
+def fitted_depth_scale(J: F64, r: F64, log_scales: F64) -> tuple[float, float]:
+    """Return the log of the query's depths over the candidate's, and its sigma, with nothing known of it
+    before, at the fit of a pose and both logs to whitened residuals r (M, 2). J (M, 2, 8): their
+    derivatives; log_scales (2,)."""
+    A = J[:, :, :7].reshape(-1, 7)
+    normal = A.T @ A + _RIDGE
+    log_scale = float(log_scales[0] - log_scales[1] + np.linalg.solve(normal, A.T @ r.ravel())[6])
+    variance = max(1.0, float((r * r).sum()) / max(1, 2 * len(r) - 7))
+    return log_scale, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
+
+
 def _linearise(
     T: F64, log_scale: float, source: F64, target: F64, noise_q: KeypointNoise, noise_c: KeypointNoise
 ) -> tuple[F64, F64, F64]:

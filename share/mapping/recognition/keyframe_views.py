@@ -53,6 +53,7 @@ class _ResidentKeyframe:
     key: KeyframeKey
     rig: Rig
     up: F64
+    up_sigma: float
     view: View
     surfaces: KeyframeImage
     has_image: bool
@@ -96,7 +97,9 @@ class KeyframeViews:
 
     def _add(self, node_id: int, key: KeyframeKey, keyframe: Keyframe, rig: Rig, has_image: bool) -> None:
         image, view = keyframe.image, keyframe.view if len(keyframe.view) else _NO_VIEW
-        self._known[node_id] = _ResidentKeyframe(key, rig, keyframe.up, view, image.without_jpeg(), has_image)
+        self._known[node_id] = _ResidentKeyframe(
+            key, rig, keyframe.up, keyframe.up_sigma, view, image.without_jpeg(), has_image
+        )
         if has_image:
             self._images[node_id] = None
             if not len(keyframe.view):
@@ -145,7 +148,9 @@ class KeyframeViews:
             if jpeg is None:
                 return None
             source = replace(known.surfaces, jpeg=jpeg)
-            self._decoded[node_id] = ImageView(source, known.rig.cam0, known.rig.T_body_cam0)
+            self._decoded[node_id] = ImageView(
+                source, known.rig.cam0, known.rig.T_body_cam0, known.up, known.up_sigma
+            )
         self._decoded.move_to_end(node_id)
         if len(self._decoded) > _DECODED_IMAGES:
             self._decoded.popitem(last=False)
@@ -189,7 +194,7 @@ class KeyframeViews:
         view = known.view
         if not len(view) and (packed := self._packed(node_id)) is not None:
             view = packed.unpack()
-        return CameraView(view, known.rig.cam0.focal, known.rig.T_body_cam0, known.up)
+        return CameraView(view, known.rig.cam0.focal, known.rig.T_body_cam0, known.up, known.up_sigma)
 
     def _packed(self, node_id: int) -> PackedView | None:
         """The view of a keyframe's image; None if it is not described."""

@@ -9,7 +9,7 @@ with the whole one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,7 +18,8 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera, project, rays
-from share.mapping.recognition.depth_scale import DepthScale
+from share.mapping.recognition.depth_scale import DepthScale, fitted_depth_scale
+from share.mapping.recognition.relative_tilt import UNKNOWN_TILT, RelativeTilt
 from share.mapping.recognition.verification import Refusal, Verification
 from share.types import F32, F64, I64, U8, KeyframeImage, View
 from share.vision import patches
@@ -58,11 +59,14 @@ _SHARED_ERROR = 2.0  # factor on sigma in the graph: the loops of a keyframe sha
 
 @dataclass(frozen=True, eq=False)
 class ImageView:
-    """The image of a keyframe with its camera, decoded when needed. T_body_cam0 (4, 4)."""
+    """The image of a keyframe with its camera, decoded when needed. T_body_cam0 (4, 4); up, up_sigma: as in
+    `CameraView`."""
 
     source: KeyframeImage
     camera: Camera
     T_body_cam0: F64
+    up: F64 = field(default_factory=lambda: np.zeros(3))
+    up_sigma: float = 0.0
 
     @cached_property
     def pixels(self) -> U8 | None:
@@ -204,9 +208,14 @@ def _verification(aligned: AlignedLoop, matches: int) -> Verification | Refusal:
     if aligned.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * aligned.found):
         return Refusal(f"{aligned.inliers} of {aligned.found} aligned patches agree with one pose")
     floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_M**2] * 3)
-    distance_m = float(np.linalg.norm(aligned.T_c_q[:3, 3]))
-    cov = _SHARED_ERROR**2 * (1 + _WIDE_VARIANCE_PER_M2 * distance_m**2) * (aligned.cov + floor)
+    cov = _variance_factor(aligned.T_c_q) * (aligned.cov + floor)
     return Verification(aligned.T_c_q, cov, matches, aligned.inliers, aligned.depth_scale)
+
+
+def _variance_factor(T_c_q: F64) -> float:
+    """Return the factor on the covariance of the aligned pose T_c_q (4, 4)."""
+    distance_m = float(np.linalg.norm(T_c_q[:3, 3]))
+    return _SHARED_ERROR**2 * (1 + _WIDE_VARIANCE_PER_M2 * distance_m**2)
 
 
 class _Alignment(NamedTuple):
@@ -226,6 +235,7 @@ def align_images(
     if not query.pyramid or not candidate.pyramid:
         return None
     T = se3.inverse(candidate.T_body_cam0) @ T_c_q @ query.T_body_cam0
+    tilt = RelativeTilt.between(query, candidate)
     for level in levels:
         forward = _align(T, query, candidate, level)
         backward = _align(se3.inverse(T), candidate, query, level)
@@ -233,7 +243,10 @@ def align_images(
         if found < _MIN_INLIERS:
             return None
         try:
-            fit = _fit_pose(T, query, candidate, forward, backward, 2.0**level)
+            aligned = query, candidate, forward, backward, 2.0**level
+            fit = _fit_pose(T, *aligned, tilt)
+            if tilt.contradicts(fit.T):
+                fit = _fit_pose(T, *aligned, UNKNOWN_TILT)
         except np.linalg.LinAlgError:
             return None
         T = fit.T
@@ -303,10 +316,16 @@ def _shared_sigma(query: ImageView, candidate: ImageView) -> float:
 
 
 def _fit_pose(
-    T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
+    T: F64,
+    query: ImageView,
+    candidate: ImageView,
+    forward: _Alignment,
+    backward: _Alignment,
+    size: float,
+    tilt: RelativeTilt,
 ) -> _AlignedPose:
-    """Fit the pose, and the scale of either view's depths, to all aligned positions. size: px of the image
-    per px of the level. Raises LinAlgError where they do not determine it."""
+    """Fit the pose, and the scale of either view's depths, to all aligned positions and to the tilts. size:
+    px of the image per px of the level. Raises LinAlgError where they do not determine it."""
     scale_sigma = np.array([query.shared_depth_sigma, candidate.shared_depth_sigma])
     prior = np.diag(np.concatenate([np.full(6, _RIDGE), scale_sigma**-2]))
     log_scales = np.zeros(2)  # of the query's depths and the candidate's
@@ -323,29 +342,20 @@ def _fit_pose(
         information = A.T @ A + prior
         gradient = A.T @ (r * root_weight[:, None]).ravel()
         gradient[6:] -= log_scales / scale_sigma**2
+        known, factor = tilt.equations(T), _variance_factor(T)  # by which the patches will count less
+        information[:6, :6] += factor * known[0]
+        gradient[:6] += factor * known[1]
         step = np.linalg.solve(information, gradient)
         T, log_scales = se3.exp(step[:6]) @ T, log_scales + step[6:]
         if np.abs(step).max() < _CONVERGED_STEP * size:
             break
     inlier, cov = chi2 < _INLIER_CHI2, np.linalg.inv(information)
-    depth_scale = _depth_scale(J[inlier], r[inlier], log_scales)
-    if depth_scale is not None:
+    depth_scale = None
+    if inlier.sum() >= _MIN_INLIERS:
+        log_and_sigma = fitted_depth_scale(J[inlier], r[inlier], log_scales)
         pose_sensitivity = cov[:6, 6] / scale_sigma[0] ** 2
-        depth_scale = DepthScale(*depth_scale[:2], pose_sensitivity, _shared_sigma(query, candidate))
+        depth_scale = DepthScale(*log_and_sigma, pose_sensitivity, _shared_sigma(query, candidate))
     return _AlignedPose(T, cov[:6, :6], int(inlier.sum()), depth_scale)
-
-
-def _depth_scale(J: F64, r: F64, log_scales: F64) -> DepthScale | None:
-    """Return the scale of the query's depths over the candidate's by residuals r (M, 2) at the fit, with
-    nothing known of it before. J (M, 2, 8) and log_scales (2,): of the fit."""
-    if len(r) < _MIN_INLIERS:
-        return None
-    A = J[:, :, :7].reshape(-1, 7)
-    normal = A.T @ A + _RIDGE * np.eye(7)
-    log_scale = float(log_scales[0] - log_scales[1] + np.linalg.solve(normal, A.T @ r.ravel())[6])
-    variance = max(1.0, float((r * r).sum()) / max(1, 2 * len(r) - 7))
-    sigma = float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance))
-    return DepthScale(log_scale, sigma)
 
 
 class _Residuals(NamedTuple):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
+from share.mapping.recognition.relative_tilt import UNKNOWN_TILT, RelativeTilt
 from share.types import F64
 
 _RIDGE = 1e-6 * np.eye(6)  # keeps a degenerate set of matches solvable; its covariance is huge
@@ -89,19 +90,30 @@ def refine_relative_pose(
     noise_q: KeypointNoise,
     noise_c: KeypointNoise,
     gate: float,
+    tilt: RelativeTilt = UNKNOWN_TILT,
     iterations: int = 10,
 ) -> RefinedPose:
-    """Refine T_c_q (4, 4) from matched keypoints y_q, y_c (N, 3), each pair with at least one depth.
+    """Refine T_c_q (4, 4) from matched keypoints y_q, y_c (N, 3), each pair with at least one depth, and from
+    what is known of the cameras' tilts.
 
     Geman-McClure weights over all matches until the step is small, then plain least squares over those within
-    `gate` (squared Mahalanobis). The covariance is that of the second pass, scaled by its residual variance,
-    at least a quarter.
+    `gate` (squared Mahalanobis). The covariance is that of the second pass, of the matches scaled by their
+    residual variance, at least a quarter.
     """
     problem = _RefinementProblem(y_q, y_c, noise_q, noise_c)
+    refined = _refine(T_c_q, problem, gate, tilt, iterations)
+    if tilt.contradicts(refined.T):
+        refined = _refine(T_c_q, problem, gate, UNKNOWN_TILT, iterations)
+    return refined
+
+
+def _refine(
+    T_c_q: F64, problem: _RefinementProblem, gate: float, tilt: RelativeTilt, iterations: int
+) -> RefinedPose:
     T, information = T_c_q, problem.information(T_c_q)
     for _ in range(iterations):
         linear = problem.linearise(T, information)
-        step = linear.step(1 / (1 + linear.d2 / gate) ** 2)
+        step = linear.step(1 / (1 + linear.d2 / gate) ** 2, tilt.equations(T))
         T = _apply_twist(step, T)
         if np.abs(step).max() < _SMALL_STEP:
             break
@@ -109,12 +121,13 @@ def refine_relative_pose(
     for _ in range(2):
         linear = problem.linearise(T, information)
         is_inlier = linear.d2 < gate
-        T = _apply_twist(linear.step(is_inlier), T)
+        known = tilt.equations(T)
+        T = _apply_twist(linear.step(is_inlier, known), T)
     dof = max(1, int(problem.residual_rows[is_inlier].sum()) - 6)
     variance = max(0.25, float(linear.d2[is_inlier].sum()) / dof)
     adjoint = se3.adjoint(se3.inverse(T))
-    cov = np.linalg.inv(linear.normal(is_inlier)[:6, :6] + _RIDGE) * variance
-    d2 = np.empty(len(y_q))
+    cov = np.linalg.inv((linear.normal(is_inlier)[:6, :6] + _RIDGE) / variance + known[0])
+    d2 = np.empty(len(linear.d2))
     d2[problem.order] = linear.d2
     return RefinedPose(se3.orthonormal(T), adjoint @ cov @ adjoint.T, d2)
 
@@ -138,10 +151,10 @@ class _LinearSystem:
         """[H g; g' c] (7, 7) of matches weighted by (N,)."""
         return np.asarray(self.Jr.reshape(7, -1) @ (self.WJr * weight).reshape(7, -1).T)
 
-    def step(self, weight: NDArray[Any]) -> F64:
-        """Gauss-Newton step (6,) of matches weighted by (N,)."""
-        normal = self.normal(weight)
-        return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE, normal[:6, 6]), np.float64)
+    def step(self, weight: NDArray[Any], known: tuple[F64, F64]) -> F64:
+        """Gauss-Newton step (6,) of matches weighted by (N,). known: equations of what else is known."""
+        normal, (H, g) = self.normal(weight), known
+        return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE + H, normal[:6, 6] + g), np.float64)
 
 
 class _RefinementProblem:

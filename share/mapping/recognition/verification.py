@@ -18,6 +18,7 @@ from share.geometry.absolute_pose import RansacOptions, absolute_pose
 from share.geometry.camera import rays
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale
 from share.mapping.recognition.refinement import KeypointNoise, refine_relative_pose, transfer_keypoints
+from share.mapping.recognition.relative_tilt import RelativeTilt
 from share.types import F64, View
 from share.vision.matching import DescriptorPairs, close_pairs, hamming_matrix, mutual_best, pairs_within
 
@@ -57,13 +58,15 @@ RANSAC_CONFIDENCE = 0.99  # per direction; the two seldom fail alike
 class CameraView:
     """A view with its camera.
 
-    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if unknown.
+    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if unknown;
+    up_sigma: of both its angles, rad.
     """
 
     view: View
     focal: float
     T_body_cam0: F64
     up: F64
+    up_sigma: float = 0.0
 
     @property
     def keypoints(self) -> F64:
@@ -163,7 +166,8 @@ def _verify_or_raise(query: CameraView, candidate: CameraView, seed: int) -> Ver
     has_gravity = bool(query.up.any() and candidate.up.any())
     if not has_gravity and len(initial_poses) > 1:
         raise _RefusedError("the two directions give different poses, and gravity is unknown")
-    fit = _best_fit(_refine_relative_poses(initial_poses, candidate_pairs, y_q, y_c, noises))
+    tilt = RelativeTilt.between(query, candidate)
+    fit = _best_fit(_refine_relative_poses(initial_poses, candidate_pairs, y_q, y_c, noises, tilt))
     _require_count(fit.inliers, MIN_INLIERS, "inliers")
     for y, side in ((fit.inliers_q, "query"), (fit.inliers_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
@@ -200,6 +204,7 @@ def _refine_relative_poses(
     y_q: F64,
     y_c: F64,
     noises: tuple[KeypointNoise, KeypointNoise],
+    tilt: RelativeTilt,
 ) -> list[_PoseFit]:
     """Refine the initial poses, except those with too few matches to compete."""
     radius = noises[0].uv / SIGMA_PX * GUIDED_PX
@@ -212,15 +217,19 @@ def _refine_relative_poses(
     fits: list[_PoseFit] = []
     for pairs, initial_pose in matched:
         if not fits or len(pairs.rows) > _COMPETING_SHARE * max(fit.inliers for fit in fits):
-            fits.append(_refine_matches(initial_pose, y_q[pairs.rows], y_c[pairs.cols], noises))
+            fits.append(_refine_matches(initial_pose, y_q[pairs.rows], y_c[pairs.cols], noises, tilt))
     return fits
 
 
 def _refine_matches(
-    initial_pose: F64, y_q: F64, y_c: F64, noises: tuple[KeypointNoise, KeypointNoise]
+    initial_pose: F64,
+    y_q: F64,
+    y_c: F64,
+    noises: tuple[KeypointNoise, KeypointNoise],
+    tilt: RelativeTilt,
 ) -> _PoseFit:
     """Refine the pose by matched keypoints, and select the inliers."""
-    refined = refine_relative_pose(initial_pose, y_q, y_c, *noises, INLIER_CHI2)
+    refined = refine_relative_pose(initial_pose, y_q, y_c, *noises, INLIER_CHI2, tilt)
     is_inlier = refined.d2 < INLIER_CHI2
     return _PoseFit(refined.T, refined.cov, (y_q, y_c), y_q[is_inlier], y_c[is_inlier])
 
