@@ -95,6 +95,14 @@ class MapSolving:
         if self._settling.is_settling(segment, reference_segment):
             self._graph.unsolved_maps.setdefault(reference_segment)
 
+    def note_time(self, now_s: float) -> bool:
+        """Note the time (s, of any clock that goes on). Return whether a map is due since an agent has
+        settled in it for long enough."""
+        overdue = self._settling.end_overdue(now_s)
+        for segment in overdue:
+            self._graph.unsolved_maps.setdefault(self._graph.reference_segments[segment])
+        return bool(overdue)
+
     def remove_run(self, agent: str) -> None:
         self._answered_ids.pop(agent, None)
 

@@ -175,6 +175,11 @@ class Mapper:
             node_id = self.queries.next_skipped()  # too late for an answer, but it may merge maps
         return node_id
 
+    def note_time(self, now_s: float) -> bool:
+        """Note the time (s, of any clock that goes on). Return whether a map has to be solved because of
+        it."""
+        return self.atlas.solving.note_time(now_s)
+
     def next_solve(self) -> SolveStep | None:
         """Next map to solve; None if there is none or one is running."""
         for map_id in [] if self._solve_job.is_running else self.atlas.solving.due_maps():

@@ -202,6 +202,7 @@ class _MapperProcess:
             return default
 
     def _send_to_solver(self) -> None:
+        self._mapper.note_time(time.monotonic())
         step = self._guarded("solve", self._mapper.next_solve, None)
         self._map_events += self._mapper.take_events()
         if step is not None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from helpers.atlas_sim import Walker, loop, settle
 
 from share.config import MergeConfig
-from share.mapping import settling as module
 from share.mapping.atlas import Atlas
-from share.mapping.settling import SETTLING_KEYFRAMES, Settling
+from share.mapping.settling import MAX_SETTLING_S, SETTLING_KEYFRAMES, Settling
 
 ANN, BOB = range(2)
 
@@ -50,16 +48,16 @@ def test_the_map_is_solved_anew_for_each_of_them() -> None:
     assert atlas.solving.due_maps() == []
 
 
-def test_who_stands_still_enters_after_some_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "MAX_SOLUTIONS", 10)
-    atlas, walkers, rng = met()
-    corrected = [one.corrections for one in settle(atlas)]
-    for k in range(10, 30):
-        atlas.add_keyframe("ann", walkers["ann"].keyframes[k])
-        atlas.propose(loop(walkers["ann"], k, walkers["bob"], 9, rng))
-        corrected += [one.corrections for one in settle(atlas)]
-    waited = next(i for i, corrections in enumerate(corrected) if "bob" in corrections)
-    assert waited == 10
+def test_who_makes_no_keyframes_enters_after_some_time() -> None:
+    """Also when nothing else happens in the map: two who stand together have to meet."""
+    atlas, *_ = met()
+    assert not atlas.solving.note_time(100.0)
+    assert not any("bob" in one.corrections for one in settle(atlas))
+    assert not atlas.solving.note_time(100.0 + 0.9 * MAX_SETTLING_S) and atlas.solving.due_maps() == []
+    assert atlas.solving.note_time(100.0 + MAX_SETTLING_S)
+    (applied,) = settle(atlas)
+    assert applied.corrections["bob"].map_id == "ann/0"
+    assert not atlas.solving.note_time(200.0) and atlas.solving.due_maps() == []
 
 
 def test_an_undone_merge_holds_no_correction_back_in_the_own_map() -> None:

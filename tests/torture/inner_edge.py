@@ -86,6 +86,7 @@ class InnerEdge:
             step = self._timed("next look-up", self.mapper.next_lookup, None)
             if step is not None:
                 self._finish(step, step.run)
+            self.mapper.note_time(self.now_ns * 1e-9)
             solve = self._timed("next solve", self.mapper.next_solve, None)
             self._found(self.mapper.take_events())
             if solve is not None:

@@ -187,6 +187,10 @@ class ModelledMapper:
         self._is_searching = step is not None
         return step
 
+    def note_time(self, now_s: float) -> bool:
+        """Nobody settles in a modelled map."""
+        return False
+
     def next_solve(self) -> ModelledStep | None:
         """Return the solve of the next map to be solved, None while one runs or without one."""
         if self._is_solving or not self._maps_to_solve:

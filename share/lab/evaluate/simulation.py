@@ -142,6 +142,8 @@ class Simulation:
         for member in self._members.values():
             self._to_agent(member, ev.AgentTick())
         self._to_edge(Tick())
+        if self.mapper.note_time(self.now_ns * 1e-9) and not self._is_busy:
+            self._run_mapper_round()
         self._schedule(_TICK_MS * MS_NS, self._tick)
 
     # Agents.
