@@ -199,6 +199,8 @@ class Town:
                 self.to_edge(Tick())
                 for peer in list(self.agents):
                     self.to_agent(peer, ev.AgentTick())
+                if self.edge is not None and self.edge.mapper.note_time(self.now_ns * 1e-9):
+                    self._mapped(self.edge, [])
 
     def to_edge(self, event: ed.EdgeEvent) -> None:
         edge = self.edge
