@@ -12,7 +12,7 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 SETTLING_KEYFRAMES = 2  # of the agent, after the gate has opened: 0.6 to 1 s of a walk
-MAX_SETTLING_S = 2.0
+MAX_SETTLING_S = 1.5
 
 
 class _Begun(NamedTuple):

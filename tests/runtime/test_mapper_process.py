@@ -74,3 +74,29 @@ def test_a_failed_keyframe_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -
     events = [one.event for found in answers if isinstance(found, MapperResult) for one in found.map_events]
     assert "step failed" in events
     assert len(events) == 2
+
+
+def test_the_mapper_is_told_the_time_before_it_says_what_to_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while nothing happens: who settles in a map without keyframes waits for it."""
+    monkeypatch.setattr(mapper_process, "WorkerProcess", NoSolver)
+    monkeypatch.setattr(mapper_process, "_REPORT_S", 0.01)
+    told: list[float | None] = []
+    has_waited = threading.Event()
+
+    def note_time(mapper: Mapper, now_s: float) -> bool:
+        told.append(now_s)
+        if len(told) >= 3:
+            has_waited.set()
+        return False
+
+    monkeypatch.setattr(Mapper, "note_time", note_time)
+    monkeypatch.setattr(Mapper, "next_solve", lambda mapper: told.append(None))
+    inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    mapper = threading.Thread(target=run_mapper, args=(inbox, lambda answer: None, Config()))
+    mapper.start()
+    assert has_waited.wait(20)
+    inbox.put(END)
+    mapper.join(20)
+    assert told[1::2] == [None] * (len(told) // 2)
+    times = told[::2]
+    assert None not in times and times == sorted(times)

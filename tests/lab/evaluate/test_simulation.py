@@ -15,6 +15,7 @@ from share.geometry.camera import Camera
 from share.lab.evaluate.emulated_network import NETWORK_PRESETS, NetworkModel
 from share.lab.evaluate.processing_delays import Delay, MeasuredDelay, ProcessingDelays
 from share.lab.evaluate.simulation import Simulation
+from share.mapping import settling
 from share.mapping.recognition.index import PlaceIndex
 from share.mapping.recognition.patch_alignment import ImageView
 from share.mapping.recognition.verification import CameraView, Refusal, Verification
@@ -132,6 +133,14 @@ def test_all_agents_are_tracked_and_corrected_in_one_map() -> None:
         assert min(corrected_ms(room, name)) > 4 + 3 + 2 * 1.0 + 3 + 4 + 14 - 15
         both = [*track_ms(room, name), *corrected_ms(room, name)]
         assert log.report()["latency_ms"]["mean"] == pytest.approx(np.mean(both))
+
+
+def test_who_settles_in_a_map_enters_it_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As without keyframes: none of those that come are enough."""
+    monkeypatch.setattr(settling, "SETTLING_KEYFRAMES", 1000)
+    assert len({report["map_id"] for report in world().reports().values()}) == 1
+    monkeypatch.setattr(settling, "MAX_SETTLING_S", 1000.0)
+    assert len({report["map_id"] for report in world().reports().values()}) == 2
 
 
 def test_messages_arrive_in_order_however_long_the_edge_takes_to_receive_one() -> None:
