@@ -65,7 +65,11 @@ def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
     assert edge.interrupt() == 0
     truth = read_tum(kitchen / "groundtruth.txt")
     report = json.loads((tmp_path / "edge" / "edge.json").read_text())
-    assert len({agent["map_id"] for agent in report["agents"].values()}) == 1
+    shared = {agent["map_id"] for agent in report["agents"].values()}
+    assert len(shared) == 1
+    own_reports = [json.loads((tmp_path / name / "report.json").read_text()) for name in agents]
+    shown = {own["protocol"]["map_id"] for own in own_reports}
+    assert shown == shared, "an agent left before it was shown the map that it was in"
     joint = joint_ate({name: (read_tum(tmp_path / name / "map.tum"), truth) for name in agents})
     print(f"joint ATE {100 * joint.joint.rmse:.2f} cm over {joint.joint.n} causal poses, one alignment")
     assert joint.joint.rmse <= 0.06
