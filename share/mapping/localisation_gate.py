@@ -32,9 +32,8 @@ def sigma_ahead(cov: F64) -> float:
 class PlacementUncertainty:
     """Uncertainty of an agent's pose in a map.
 
-    cov (6, 6): of T_map_odom. sigma_m: `sigma_ahead` of the body's pose, relative to what is shown around it
-    where that is known. answered_id: the agent's keyframe with a loop that is new in this solution, or None.
-    is_worn: by somebody who waits to share the map.
+    cov (6, 6): of T_map_odom. sigma_m: `sigma_ahead` of the body's pose. answered_id: the agent's keyframe
+    with a loop that is new in this solution, or None. is_worn: by somebody who waits to share the map.
     """
 
     cov: F64

@@ -20,7 +20,6 @@ from share.mapping.settling import Settling
 from share.types import F64, Correction
 
 _OUTLIER_CHI2 = 1000.0  # loops with a larger chi-squared after a solution are dropped
-_PLACE_KEYFRAMES = 40  # newest ones of a segment, whose loops say where it is
 _MIN_STEP_VARIANCE = 1e-8  # m^2, below the floor of any step
 
 
@@ -45,8 +44,7 @@ class SolveJob:
 
     is_reset: `change` is the whole graph, and the solver has to forget what it knew. segments: of the map,
     each with its newest node. covariance_segments: those whose newest node needs a covariance. answered_ids:
-    newest keyframe of each agent that this solution answers. places: of segments that are not shown this map
-    yet, a keyframe that is, and their newest one.
+    newest keyframe of each agent that this solution answers.
     """
 
     map_id: str
@@ -57,7 +55,6 @@ class SolveJob:
     change: GraphUpdate
     is_reset: bool
     answered_ids: tuple[tuple[str, int], ...]
-    places: tuple[tuple[int, int], ...] = ()
 
     @property
     def covariance_nodes(self) -> tuple[int, ...]:
@@ -138,19 +135,17 @@ class MapSolving:
         agents = {graph.odometry.segments[s].agent for s in segments}
         graph.unsolved_maps.pop(reference_segment, None)
         is_reset = graph.edges.is_reset
-        covariance_segments = self._segments_wanting_covariance(reference_segment, segments)
         return SolveJob(
             map_id,
             segments,
             graph.anchor(reference_segment),
             tuple(graph.odometry.segments[s].nodes[-1] for s in segments),
-            covariance_segments,
+            self._segments_wanting_covariance(reference_segment, segments),
             graph.edges.take_update(graph.poses, graph.gravity_factors),
             is_reset,
             tuple(
                 (agent, self._answered_ids.pop(agent)) for agent in sorted(agents & self._answered_ids.keys())
             ),
-            self._places(reference_segment, covariance_segments),
         )
 
     def _segments_wanting_covariance(
@@ -173,32 +168,6 @@ class MapSolving:
                 or self._localisation_gate.published_cov(s, reference_segment) is None
             )
         )
-
-    def _places(self, reference_segment: int, segments: Sequence[int]) -> tuple[tuple[int, int], ...]:
-        """Pairs of a keyframe that agents are shown in this map, and the newest one of a segment that is not
-        shown it: of those that loops connect it with, the one from which it is known best."""
-        graph, gate = self._graph, self._localisation_gate
-        out: list[tuple[int, int]] = []
-        for segment in segments:
-            if segment == reference_segment or gate.is_published(segment, reference_segment):
-                continue
-            nodes = graph.odometry.segments[segment].nodes
-            shown = [
-                n
-                for n in self._loop_partners(nodes[-_PLACE_KEYFRAMES:])
-                if (other := graph.odometry.nodes[n].segment) == reference_segment
-                or gate.is_published(other, reference_segment)
-            ]
-            if shown:
-                covs = graph.relative_estimates(nodes[-1], shown).cov
-                out.append((shown[int(np.argmin([sigma_ahead(cov) for cov in covs]))], nodes[-1]))
-        return tuple(out)
-
-    def _loop_partners(self, node_ids: Sequence[int]) -> list[int]:
-        """Nodes with which these have loops."""
-        edges = self._graph.edges
-        loops = (edges.by_id[n] for node in node_ids for n in edges.incident(node) if n in edges.loops)
-        return sorted({end for edge in loops for end in (edge.a, edge.b)}.difference(node_ids))
 
     def apply(self, job: SolveJob, solution: GraphSolution) -> AppliedSolution:
         """Apply a solution; keyframes and loops that arrived meanwhile are kept.
@@ -244,13 +213,11 @@ class MapSolving:
         """Pass the new covariances to the localisation gate. Return the sigma (m) of agents that wait."""
         odometry, nodes = self._graph.odometry, self._graph.odometry.nodes
         covariances = dict(zip(job.covariance_nodes, solution.covariances, strict=True))
-        of_places = zip(job.places, solution.pair_covariances, strict=True)
-        place_covs = {last: cov for (_, last), cov in of_places}
         answered_ids = dict(job.answered_ids)
         uncertainties = {
             segment: PlacementUncertainty(
                 se3.inverse_cov(nodes[last].T_odom_body, covariances[last]),
-                sigma_ahead(place_covs.get(last, covariances[last])),
+                sigma_ahead(covariances[last]),
                 answered_ids.get(odometry.segments[segment].agent),
                 odometry.segments[segment].is_worn,
             )

@@ -122,7 +122,7 @@ class SolveStep:
         if self.job.is_reset:
             solver.clear()
         solver.update(self.job.change)
-        return solver.solve(self.job.anchor, self.job.covariance_nodes, self.job.places)
+        return solver.solve(self.job.anchor, self.job.covariance_nodes)
 
 
 LookupStep = DescribeStep | IndexStep | QueryStep | VerifyStep | AlignStep

@@ -75,7 +75,7 @@ def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, GraphSolution]:
     atlas.graph.edges.reset()
     job, solver = atlas.solving.make_job(map_id), PoseGraphSolver()
     solver.update(job.change)
-    return job, solver.solve(job.anchor, job.covariance_nodes, job.places)
+    return job, solver.solve(job.anchor, job.covariance_nodes)
 
 
 def settle(atlas: Atlas) -> list[AppliedSolution]:

@@ -69,7 +69,7 @@ class Room:
     def solve(self) -> None:
         job = self.atlas.solving.make_job("a/0")
         self.solver.update(job.change)
-        self.atlas.solving.apply(job, self.solver.solve(job.anchor, job.covariance_nodes, job.places))
+        self.atlas.solving.apply(job, self.solver.solve(job.anchor, job.covariance_nodes))
 
     def loops(self, at: range) -> list[Loop]:
         a, b = self.walkers

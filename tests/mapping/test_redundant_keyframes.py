@@ -146,7 +146,7 @@ def settle(atlas: Atlas, solver: PoseGraphSolver) -> None:
         if job.is_reset:
             solver.clear()
         solver.update(job.change)
-        atlas.solving.apply(job, solver.solve(job.anchor, job.covariance_nodes, job.places))
+        atlas.solving.apply(job, solver.solve(job.anchor, job.covariance_nodes))
 
 
 def test_a_culled_map_is_solved_as_well_and_continues() -> None:
@@ -193,7 +193,7 @@ def test_keyframes_removed_while_the_map_is_solved() -> None:
         atlas.propose(x)
     job = atlas.solving.make_job("bob/0")
     solver.update(job.change)
-    solution = solver.solve(job.anchor, job.covariance_nodes, job.places)
+    solution = solver.solve(job.anchor, job.covariance_nodes)
     (gone,) = atlas.remove_keyframes([atlas.graph.odometry.node_id(KeyframeKey("bob", 30))])
     for x in near_loops(*walkers, rng):
         if gone.key not in (x.a, x.b):

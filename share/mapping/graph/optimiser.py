@@ -12,7 +12,7 @@ Dellaert et al., *Subgraph-preconditioned Conjugate Gradients for Large Scale SL
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -64,7 +64,7 @@ def _levenberg_marquardt(
     poses: F64, gravity_factors: F64, edges: EdgeArrays, anchor_index: int, cauchy: float
 ) -> OptimisedPoses:
     current, damping, iterations = residuals(poses, edges), 0.0, 0
-    gauge_projector = _gauge_projector(poses[anchor_index], gravity_factors)
+    gauge_projector = tilt_projector(poses[anchor_index]) if gravity_factors.any() else np.zeros((6, 6))
 
     def cost_of(at: EdgeResiduals, poses: F64) -> float:
         return _robust_cost(at, edges, cauchy) + gravity_cost(poses, gravity_factors)
@@ -94,15 +94,6 @@ def _levenberg_marquardt(
     return OptimisedPoses(
         poses, gauge_projector, current, _cauchy_weights(current, edges, cauchy), iterations
     )
-
-
-def with_anchor(solved: OptimisedPoses, gravity_factors: F64, anchor_index: int) -> OptimisedPoses:
-    """Return the same solution with another pose as the one that stays."""
-    return replace(solved, gauge_projector=_gauge_projector(solved.poses[anchor_index], gravity_factors))
-
-
-def _gauge_projector(anchor: F64, gravity_factors: F64) -> F64:
-    return tilt_projector(anchor) if gravity_factors.any() else np.zeros((6, 6))
 
 
 def weighted_jacobians(residuals_at: EdgeResiduals, weights: F64, edges: EdgeArrays) -> tuple[F64, F64]:

@@ -6,7 +6,7 @@ Runs in one thread, without a clock. Cost: docs/understand/mapping.md.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from share.checks import checked_array
 from share.mapping.graph.covariance import relative_covariances
 from share.mapping.graph.edges import EdgeArrays, PoseEdge
 from share.mapping.graph.gravity import restore_tilt, turned_upright
-from share.mapping.graph.optimiser import chain_order, optimise, with_anchor
+from share.mapping.graph.optimiser import chain_order, optimise
 from share.types import F64, I64
 
 
@@ -90,8 +90,7 @@ class GraphSolution:
     pose_ids (N,), ascending, poses (N, 4, 4). covariances (K, 6, 6): of the wanted poses relative to the
     anchor, right perturbation, upper bounds (`share.mapping.graph.covariance`). loop_ids (L,), loop_chi2
     (L,): squared Mahalanobis residual. reason: why it is not solved; then poses are unchanged and there are
-    no covariances; empty if solved. pair_covariances (P, 6, 6): of the second pose of each wanted pair
-    relative to the first.
+    no covariances; empty if solved.
     """
 
     pose_ids: I64
@@ -101,7 +100,6 @@ class GraphSolution:
     loop_chi2: F64
     iterations: int
     reason: str = ""
-    pair_covariances: F64 = field(default_factory=lambda: np.zeros((0, 6, 6)))
 
 
 CAUCHY_WIDTH = 3.0  # 2.4 is usual for 6 degrees of freedom
@@ -135,23 +133,18 @@ class PoseGraphSolver:
         self._pose_ids, self._poses, self._gravity_factors = pose_ids, poses, gravity_factors
         self._edge_ids, self._edges = edge_ids, edges
 
-    def solve(
-        self, anchor: int, wanted: Sequence[int] = (), pairs: Sequence[tuple[int, int]] = ()
-    ) -> GraphSolution:
+    def solve(self, anchor: int, wanted: Sequence[int] = ()) -> GraphSolution:
         """Return the most likely poses of the component of pose `anchor`.
 
         The anchor stays, except that all turn slowly upright about it where gravity factors are known: a map
         that turned at once would move under those who are in it. wanted: poses whose covariances are
-        returned, without the tilt that the whole map shares; pairs: whose relative covariances are. An
-        unsolvable component is returned unchanged, with the reason. Deterministic. Raises ValueError if the
-        anchor is unknown or a wanted pose is not connected to it.
+        returned, without the tilt that the whole map shares. An unsolvable component is returned unchanged,
+        with the reason. Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not
+        connected to it.
         """
         component, component_edges = self._component(anchor)
         pose_ids, edges = self._pose_ids[component], self._edges[component_edges]
-        goals, ends = (
-            _indices(pose_ids, np.array(ids, np.int64).ravel(), f"connected to {anchor}")
-            for ids in (wanted, pairs)
-        )
+        goals = _indices(pose_ids, np.array(wanted, np.int64), f"connected to {anchor}")
         local_edges = edges.with_ends(np.searchsorted(pose_ids, edges.a), np.searchsorted(pose_ids, edges.b))
         order = chain_order(len(component), local_edges[~local_edges.is_loop])
         rank = np.argsort(order)
@@ -162,24 +155,17 @@ class PoseGraphSolver:
         minimum = optimise(upright, gravity_factors, ordered_edges, anchor_index, self._cauchy_width)
         poses = (before if minimum.reason else restore_tilt(minimum.poses, before, anchor_index))[rank]
         if minimum.reason:
-            goals, ends = goals[:0], ends[:0]
+            goals = goals[:0]
         else:
             self._poses = _with_poses(self._poses, component, poses)
-
-        def covariances(origin: int, goals: I64) -> F64:
-            at = minimum if origin == anchor_index else with_anchor(minimum, gravity_factors, origin)
-            return relative_covariances(ordered_edges, gravity_factors, at, origin, goals)
-
-        of_pairs = [covariances(int(a), np.array([b])) for a, b in rank[ends].reshape(-1, 2)]
         return GraphSolution(
             pose_ids,
             poses,
-            covariances(anchor_index, rank[goals]),
+            relative_covariances(ordered_edges, gravity_factors, minimum, anchor_index, rank[goals]),
             self._edge_ids[component_edges][edges.is_loop],
             minimum.residuals.chi2[edges.is_loop],
             minimum.iterations,
             minimum.reason,
-            np.array(of_pairs).reshape(-1, 6, 6),
         )
 
     def _component(self, anchor: int) -> tuple[I64, I64]:
