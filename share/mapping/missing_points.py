@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from share.geometry import se3
 from share.mapping.recognition.refinement import transfer_keypoints
@@ -154,7 +155,5 @@ def _is_inside(moved: F64, target: F64) -> NDArray[np.bool_]:
 
 def _near_keypoints(a: F64, b: F64) -> tuple[I64, I64, F64]:
     """Pairs of points a (N, 2) and b (K, 2), pixels, that are near: rows, columns, distances (M,)."""
-    from scipy.spatial import KDTree
-
     distances = KDTree(a).sparse_distance_matrix(KDTree(b), _OCCLUDER_PX, output_type="ndarray")
     return distances["i"], distances["j"], distances["v"]

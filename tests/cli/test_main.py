@@ -86,20 +86,6 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.splitlines()[-1] == "loaded:", done.stderr
 
 
-@pytest.mark.long
-def test_an_edge_starts_without_scipy_and_an_agent_is_imported_with_its_linear_algebra_alone():
-    """Its statistics and trees take longer to import than all else; the clock's filter brings them later."""
-    program = (
-        "import sys, share.runtime.edge, share.runtime.mapper_process\n"
-        "print('loaded:', *{'scipy', 'share.odometry.filter'} & set(sys.modules))\n"
-        "import share.runtime.agent\n"
-        "heavy = ('stats', 'spatial', 'sparse', 'optimize')\n"
-        "print('loaded:', *{f'scipy.{name}' for name in heavy} & set(sys.modules))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
-    assert done.stdout.splitlines() == ["loaded:", "loaded:"], done.stderr
-
-
 def test_help_is_quick():
     """CPU time of the whole process, best of three: this machine may be busy."""
     spent = []
