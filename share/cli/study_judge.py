@@ -164,7 +164,7 @@ def _floor(file: str, bodies: Mapping[str, MocapTrajectory | None], text: str, u
 def _print_goals(
     before: TrialRecord, after: TrialRecord, plan: StudyPlan, lines: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Print each goal as the map and as the motion capture have it, and a note where they are far apart."""
+    """Print each goal as the map and as the motion capture have it."""
     rows = [
         [
             "goal",
@@ -201,9 +201,10 @@ def _median_apart_m(lines: Sequence[Mapping[str, Any]]) -> float:
 
 def _utc_s(text: str) -> float:
     """Return a UTC time, s since 1970. Raises UsageError."""
+    from share.lab.study.mocap_judge import utc_s
+
     try:
-        when = datetime.fromisoformat(text)
-        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+        return utc_s(text)
     except (ValueError, OverflowError):
         raise UsageError(f"--zero {text:.40}: is not a UTC time such as 2026-11-28T10:03:12.34") from None
 

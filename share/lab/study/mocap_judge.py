@@ -18,6 +18,7 @@ import numpy as np
 
 from share.errors import DataError, UsageError
 from share.geometry import se3
+from share.lab.mocap.initialisation import nearest_axis_rotation
 from share.lab.mocap.trajectory import MocapTrajectory
 from share.lab.study.plan import StudyPlan
 from share.lab.study.standstill import BY_MAP, BY_TRUTH, MotionWatch, RobotSample
@@ -34,8 +35,6 @@ _WINDOW_S = 0.5  # over which speed is taken
 _DRIVES_M_S, _TURNS_RAD_S = 0.04, 0.15
 _MOTION_SEEN_S = 1.0  # at most, from the robot's first motion until a map shows it
 _MIN_AGREEMENT, _MIN_LEAD, _PEAK_S = 0.6, 0.1, 3.0
-_UPS = {"z": np.eye(3), "y": se3.so3_exp(np.array([math.pi / 2, 0.0, 0.0]))}
-UP_AXES = tuple(_UPS)
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class RobotTrack:
     def of(mocap: MocapTrajectory, T_world_floor: PlanarPose, up: str) -> RobotTrack:
         """Return the track of the robot's body; T_world_floor: in the world with z up."""
         stamps = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, round(_STEP_S * 1e9))
-        T = mocap.rotated(_UPS[up]).interpolate(stamps)
+        T = mocap.rotated(_levelling(up)).interpolate(stamps)
         axis = int((T[:, :2, :3] ** 2).sum(1).mean(0).argmax())  # the body's most level one
         c, s = math.cos(T_world_floor.yaw), math.sin(T_world_floor.yaw)
         xy = (T[:, :2, 3] - [T_world_floor.x, T_world_floor.y]) @ np.array([[c, -s], [s, c]])
@@ -101,13 +100,24 @@ class RobotTrack:
         return float(np.diff(np.concatenate([[from_s], seen_s, [to_s]])).max())
 
 
+def _levelling(up: str) -> F64:
+    """Return the rotation (3, 3) to z up of a world whose up axis is x, y or z."""
+    return nearest_axis_rotation(np.eye(3)["xyz".index(up)])
+
+
 def floor_in_world(T_world_marker: F64, up: str) -> PlanarPose:
     """Return where the floor's marker is in the world with z up, by a body's pose (4, 4) in the motion
     capture's axes: it faces along its x axis."""
-    return flattened(se3.from_rt(_UPS[up], np.zeros(3)) @ T_world_marker)
+    return flattened(se3.from_rt(_levelling(up), np.zeros(3)) @ T_world_marker)
 
 
 # ---------------------------------------------------------------- clocks
+
+
+def utc_s(text: str) -> float:
+    """Return a UTC time in ISO 8601, s since 1970. Raises ValueError."""
+    when = datetime.fromisoformat(text)
+    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
 
 
 def utc_times(events: Sequence[Mapping[str, Any]]) -> list[float]:
@@ -116,10 +126,9 @@ def utc_times(events: Sequence[Mapping[str, Any]]) -> list[float]:
     out, zero_s = list[float](), 0.0
     for event in events:
         if event["event"] == "begin":
-            when = datetime.fromisoformat(event["utc"])
-            utc_s = (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-            zero_s = utc_s - event["t_s"]
-            if out and utc_s < max(out) - _PEAK_S:
+            begin_s = utc_s(event["utc"])
+            zero_s = begin_s - event["t_s"]
+            if out and begin_s < max(out) - _PEAK_S:
                 raise DataError(_CLOCK_WAS_SET)
         out.append(zero_s + event["t_s"])
     if out and not max(out) - out[0] <= _LONGEST_S:

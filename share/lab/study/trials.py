@@ -21,10 +21,8 @@ from share.files.reading import MB
 from share.lab.study.plan import TRIALS, StudyPlan, SuccessRule
 from share.robot.settings import CREATE3_SPEED_M_S
 
-EVENTS, EVENTS_BY_MAP = (
-    "events.jsonl",
-    "events-map.jsonl",
-)  # the second: what the map said of a trial judged anew
+EVENTS = "events.jsonl"
+EVENTS_BY_MAP = "events-map.jsonl"  # what the map said of a trial that was judged anew
 MAX_LINES_BYTES = 20 * MB  # of a trial, or of all answers
 JUDGES = ("mocap", "map", "simulation")
 _MAX_POSITION_M, _MAX_PATH_M = 1e4, 1e6
