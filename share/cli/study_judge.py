@@ -75,21 +75,12 @@ def judge(
     from share.lab.mocap.files import pick_body, read_bodies
     from share.lab.study.mocap_judge import ClockMatch, RobotTrack, judged, match_clocks
     from share.lab.study.plan import read_plan
-    from share.lab.study.trials import EVENTS, EVENTS_BY_MAP, MAX_LINES_BYTES, read_trial
+    from share.lab.study.trials import EVENTS_BY_MAP, MAX_LINES_BYTES, read_trial
 
     plan = read_plan(folder)
     planned, path = _planned_trial(folder, plan, trial)
     kept = path.with_name(EVENTS_BY_MAP)
-    newest = read_trial(path, plan, *planned)
-    is_judged = newest.judge == "mocap" and kept.exists()
-    if newest.judge == "map" and kept.exists() and _lines(kept) != _lines(path):
-        raise UsageError(f"{kept}: is of another trial than {EVENTS}; move it away")
-    source = kept if is_judged else path
-    before = read_trial(source, plan, *planned) if is_judged else newest
-    if before.is_left or not before.is_complete:
-        raise UsageError(f"{trial}: was not carried through, so it counts in no statistics")
-    if before.judge != "map":
-        raise UsageError(f"{source}: is judged by {before.judge}, and there is no {EVENTS_BY_MAP}")
+    source, before = _judged_by_map(plan, planned, path, kept)
     events = read_json_lines(source, MAX_LINES_BYTES)
     bodies = read_bodies(mocap_file, rotations)
     _, mocap = pick_body(str(mocap_file), bodies, body, "robot", "--body")
@@ -102,14 +93,15 @@ def judge(
             lines = judged(events, plan, track, clock.zero_utc_s)
     except DataError as error:
         raise DataError(f"{mocap_file}: {error}") from None
-    apart_m = _median_apart_m(lines)
+    apart = _apart_m(lines)
+    apart_m = sorted(apart.values())[len(apart) // 2] if apart else 0.0
     if apart_m > _FAR_M and zero is None:
         raise UsageError(
             f"map and motion capture have the robot {apart_m:.2f} m apart at most calls: is it this trial's "
             "take, and are --floor, --up and --body right? If the map was so wrong, give --zero"
         )
     if not kept.exists():
-        atomic_write(kept, _lines(path))
+        atomic_write(kept, _content(path))
     atomic_write(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
     if zero is None:
         when = datetime.fromtimestamp(clock.zero_utc_s, UTC).isoformat(timespec="milliseconds")[:-6]
@@ -117,11 +109,30 @@ def judge(
             f"its clock was 0 at {when} UTC (--zero for other trials of this take); driving and standing "
             f"agree to {clock.agreement:.2f}, at the next best time to {clock.next_agreement:.2f}"
         )
-    _print_goals(before, read_trial(path, plan, *planned), plan, lines)
+    _print_goals(before, read_trial(path, plan, *planned), plan, apart)
     click.echo(f"{path}: judged by motion capture; what the map said: {kept}")
 
 
-def _lines(path: Path) -> bytes:
+def _judged_by_map(
+    plan: StudyPlan, planned: tuple[str, int, str], path: Path, kept: Path
+) -> tuple[Path, TrialRecord]:
+    """Return the file with what the map said of a trial that was carried through, and its record. Raises
+    UsageError, DataError."""
+    from share.lab.study.trials import read_trial
+
+    source, record = path, read_trial(path, plan, *planned)
+    if record.judge == "mocap" and kept.exists():
+        source, record = kept, read_trial(kept, plan, *planned)
+    elif record.judge == "map" and kept.exists() and _content(kept) != _content(path):
+        raise UsageError(f"{kept}: is of another trial than {path.name}; move it away")
+    if record.is_left or not record.is_complete:
+        raise UsageError(f"{path.parent.name}: was not carried through, so it counts in no statistics")
+    if record.judge != "map":
+        raise UsageError(f"{source}: is judged by {record.judge}, and there is no {kept.name}")
+    return source, record
+
+
+def _content(path: Path) -> bytes:
     from share.files.reading import read_bytes, read_errors
     from share.lab.study.trials import MAX_LINES_BYTES
 
@@ -162,9 +173,9 @@ def _floor(file: str, bodies: Mapping[str, MocapTrajectory | None], text: str, u
 
 
 def _print_goals(
-    before: TrialRecord, after: TrialRecord, plan: StudyPlan, lines: Sequence[Mapping[str, Any]]
+    before: TrialRecord, after: TrialRecord, plan: StudyPlan, apart: Mapping[int, float]
 ) -> None:
-    """Print each goal as the map and as the motion capture have it."""
+    """Print each goal as the map and as the motion capture have it. apart: see `_apart_m`."""
     rows = [
         [
             "goal",
@@ -176,7 +187,6 @@ def _print_goals(
             "apart, m",
         ]
     ]
-    apart = _apart_m(lines)
     for number, goal in sorted(after.goals.items()):
         both = [one.goals[number] for one in (before, after)]
         times = [_number(one.reached_s(plan.success), "no") for one in both]
@@ -192,11 +202,6 @@ def _apart_m(lines: Sequence[Mapping[str, Any]]) -> dict[int, float]:
         for line in lines
         if line["event"] == "call" and line["robot_by_map_m"] is not None
     }
-
-
-def _median_apart_m(lines: Sequence[Mapping[str, Any]]) -> float:
-    apart = sorted(_apart_m(lines).values())
-    return apart[len(apart) // 2] if apart else 0.0
 
 
 def _utc_s(text: str) -> float:

@@ -132,6 +132,19 @@ def prepare_run(
 ) -> LoopRun:
     """Return a robot that is to be sent about in a session's room. session: None without pictures, where the
     robot does not see. Deterministic for given options. Raises UsageError."""
+    loop, giver = _loop(session, room, options, config, robot, progress)
+    schedule_faults(loop, options.faults)
+    return LoopRun(options, loop, giver)
+
+
+def _loop(
+    session: Session | None,
+    room: EmulatedRoom,
+    options: LoopOptions,
+    config: Config,
+    robot: RobotSettings,
+    progress: Progress,
+) -> tuple[RobotLoop, GoalGiver]:
     rngs = [np.random.default_rng((options.seed, stream)) for stream in range(4)]
     T_world_base = start_pose(room.grid, room.people_at(0), rngs[0])
     T_base_body = inverse(robot.T_body_base)
@@ -144,7 +157,7 @@ def prepare_run(
         times = [round(1e9 * k / _FRAME_HZ) for k in range(int(options.seconds * _FRAME_HZ))]
         own_pose = _own_pose(base, options.localisation)
         loop = RobotLoop(config, [], *common, None, network, own_pose, times)
-        return _with_faults(options, loop, GoalGiver(loop, draw, count, points_in_room))
+        return loop, GoalGiver(loop, draw, count, points_in_room)
     if session is None:
         raise ValueError("a robot that sees needs the session's recordings")
     members = tracked_people(session, room, config, network, progress)
@@ -153,20 +166,14 @@ def prepare_run(
     loop = RobotLoop(config, members, *common, agent, network)
     alone = HeadsetPointing(loop, ROBOT, lambda now_ns: base.body.part(now_ns, now_ns).poses(_at(now_ns))[0])
     if not room.people:
-        return _with_faults(options, loop, GoalGiver(loop, draw, count, alone))
+        return loop, GoalGiver(loop, draw, count, alone)
     wearer = room.people[0]
 
     def wearer_pose(now_ns: int) -> Any:
         return wearer.path.poses(np.array([now_ns + wearer.path.start_ns]))[0]
 
     pointing = HeadsetPointing(loop, wearer.name, wearer_pose)
-    giver = GoalGiver(loop, draw, count, pointing, drawn_goals(room.grid, rngs[3]), alone)
-    return _with_faults(options, loop, giver)
-
-
-def _with_faults(options: LoopOptions, loop: RobotLoop, giver: GoalGiver) -> LoopRun:
-    schedule_faults(loop, options.faults)
-    return LoopRun(options, loop, giver)
+    return loop, GoalGiver(loop, draw, count, pointing, drawn_goals(room.grid, rngs[3]), alone)
 
 
 def _at(session_ns: int) -> Any:
