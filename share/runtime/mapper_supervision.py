@@ -55,7 +55,7 @@ class MapperRestarts:
         if self.store is not None:
             name = self.store.path.name
             lines += [f"map {name}: {problem}" for problem in self.store.problems]
-            if not self.store.writable:
+            if self.store.read_only_reason:  # a map that was closed at the end has none
                 lines.append(f"map {name}: {self.store.read_only_reason}; nothing new is stored")
         said = "\n".join(lines)
         if earlier := [copy for copy in self._copies if not re.search(rf"{re.escape(copy)}\b", said)]:

@@ -242,6 +242,13 @@ def test_a_read_only_map_is_a_loss():
     assert restarts.losses == ["the map file is no longer used: ValueError: x; nothing is saved"]
 
 
+def test_a_map_that_is_closed_at_the_end_is_no_loss(path):
+    """The last report, edge.json, is made after that."""
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.05, print)
+    assert not store.writable and restarts.losses == []
+
+
 class BusyLink(Link):
     """200 messages that have arrived at once."""
 
