@@ -84,7 +84,7 @@ POLICY_TEXTS = {
     "share": "rate of each agent by its quality of experience; merges with a small gain are skipped",
     "share-paper": "the paper's algorithm to the letter: no budget of the room, low QoE raises the rate",
     BASE_POLICY: "every keyframe is sent, every verified loop is merged",
-    "linear": "rate falls with the delay; merges as share",
+    "linear": "rate falls with the delay; every verified loop is merged",
     "equal": "as share, robots rated like headsets",
     "random": "as share, with control gains drawn from control.random_seed",
     "fixed": "every agent sends control.fixed_rate_hz",

@@ -172,12 +172,10 @@ class StreamedPolicy(Policy):
 
 
 class LinearPolicy(Policy):
-    """The drop rate grows linearly with the delay: 0 at 20 ms, 1 at 1 s.
+    """The drop rate grows linearly with the delay: 0 at 20 ms, 1 at 1 s; else as `CovinsGPolicy`.
 
     Never below `rate_min_hz`: an agent that may send nothing would never be evaluated again.
     """
-
-    has_merge_gate = True
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int

@@ -105,7 +105,7 @@ class PoseUpdate:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Sent with each keyframe, and twice a second between them: how the agent is served.
+    """Sent with each keyframe, and once a second between them: how the agent is served.
 
     keyframe: which it goes with, -1 between them. delay_ms: from a frame to the correction that answers it,
     filtered. error_cm: expected error; None: unknown. track_ms: from a frame's arrival until its keyframe is

@@ -60,7 +60,7 @@ def test_every_configurable_policy_exists() -> None:
         ("share", True, False, False),
         ("share-paper", True, False, False),
         ("covins-g", False, True, False),
-        ("linear", True, True, False),
+        ("linear", False, True, False),
         ("equal", True, True, False),
         ("random", True, False, False),
         ("fixed", True, True, False),
