@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("source")
-@click.option("--name", required=True, help="Name of this agent, unique at its edge.")
+@click.option("--name", metavar="NAME", required=True, help="Name of this agent, unique at its edge.")
 @click.option(
     "--kind",
     type=click.Choice(["ar", "robot"]),
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     help="Emulate a network to the edge: wifi5 (an access point alone), wifi-busy (shared with many devices) "
     "or a YAML file (docs/do/network.md).",
 )
-@click.option("--link-seed", type=int, default=0, help="Seed of its delays and losses.")
+@click.option("--link-seed", type=int, default=0, help="Seed of the emulated network's delays and losses.")
 @click.option("--streamed", is_flag=True, help="Send raw frames and let the edge track (policy streamed).")
 @click.option(
     "--true-error", is_flag=True, help="Report the error against ground truth to the edge, for experiments."

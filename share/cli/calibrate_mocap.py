@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("source")
 @click.option(
+    "--mocap",
     "--truth",
+    "truth",
     required=True,
     metavar="FILE",
     type=options.PATH,
@@ -72,10 +74,10 @@ def mocap(
     """Estimate the pose of a motion capture's body in the IMU frame, the tilt of its world, and the offset
     and drift of its clock.
 
-    SOURCE and --truth are recordings of the same motion, about a minute long.
+    SOURCE and --mocap are recordings of the same motion, about a minute long.
 
     \b
-    Example:  share calibrate mocap walk.mcap --truth walk.vicon.tum --out calib/mine
+    Example:  share calibrate mocap walk.mcap --mocap walk.vicon.tum --out calib/mine
     """
     from share.files.writing import atomic_write, writable_dir
     from share.lab.calibrate.imu_table import read_imu, stated_noise

@@ -22,7 +22,7 @@ COMMANDS = {
     "dataset": (
         "share.cli.dataset",
         "dataset",
-        "Inspect, convert, recover, align recordings; export maps, forget.",
+        "Inspect, convert, recover, align recordings; export and prune maps.",
     ),
     "dataset align": (
         "share.cli.dataset_align",
@@ -51,7 +51,7 @@ COMMANDS = {
     "evaluate paper": (
         "share.cli.evaluate_paper",
         "paper",
-        "Each table and figure of the paper, beside those measured here.",
+        "Report each table and figure of the paper beside the measured ones.",
     ),
     "evaluate compare": ("share.cli.evaluate_compare", "compare", "Compare SHARE's tracker with others."),
     "train": ("share.cli.train", "train", "Train the model that estimates the tracking error."),
@@ -106,6 +106,17 @@ COMMANDS = {
 }
 
 
+def _completed(command: click.Command) -> click.Command:
+    """Return the command with `-v`; its help has N and X for numbers, where click has INTEGER RANGE."""
+    for option in command.params:
+        if isinstance(option, click.Option) and option.metavar is None:
+            if isinstance(option.type, click.types.IntParamType):
+                option.metavar = "N"
+            elif isinstance(option.type, click.types.FloatParamType):
+                option.metavar = "X"
+    return with_verbose(command)
+
+
 class CommandGroup(click.Group):
     """A click group: the commands added to it, then the rows of `COMMANDS` that begin with `prefix`."""
 
@@ -123,10 +134,10 @@ class CommandGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self._rows:
             added = super().get_command(ctx, cmd_name)
-            return None if added is None else with_verbose(added)
+            return None if added is None else _completed(added)
         module, attribute, _ = self._rows[cmd_name]
         command: click.Command = getattr(importlib.import_module(module), attribute)
-        return with_verbose(command)
+        return _completed(command)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -34,7 +34,7 @@ class _Age(click.ParamType[float]):
 
 @click.command(short_help="Delete agents or old keyframes from a map for good.")
 @click.argument("map_file", metavar="MAP", type=options.PATH)
-@click.option("--agent", "agents", multiple=True, metavar="NAME", help="Delete this agent; may be repeated.")
+@click.option("--agent", "agents", multiple=True, metavar="NAME", help="Delete this agent. May be repeated.")
 @click.option(
     "--older-than",
     "age_s",

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 @click.option("--out", metavar="DIR", type=options.PATH, default="share-demo", help="Output folder.")
 @click.option(
     "--scene",
+    metavar="S",
     shell_complete=complete_scene,
     help="Kind of room (see share emulate --help).  [default: warehouse]",
 )

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     help="What this device should be: d435i, d435i-n100-headset, d435i-turtlebot4, laptop-edge, or a file.",
 )
 @click.option("--calib", metavar="DIR", type=options.PATH, help="Calibration of this device to check.")
-@click.option("--edge", "address", metavar="tcp://H:P", help="Edge to connect to.")
+@click.option("--edge", "address", metavar="tcp://H:P", help="Address of an edge to try.")
 @options.keys
 @click.option("--server-key", metavar="FILE|KEY", help="Public key of that edge.")
 @click.option(
@@ -38,18 +38,18 @@ if TYPE_CHECKING:
     default=".",
     metavar="DIR",
     type=options.PATH,
-    help="Folder for recordings; its disk is checked.",
+    help="Folder for recordings, whose disk is checked, and for the report of --acceptance.",
 )
 @click.option(
     "--acceptance",
     is_flag=True,
-    help="Then go through ten minutes with the camera, and write a report file to --out.",
+    help="Then lead through ten minutes with the camera, and write a report file to --out.",
 )
 @click.option(
     "--minutes",
     type=click.FloatRange(0.2, 60),
     default=10.0,
-    help="Length of --acceptance; a shorter one says less.",
+    help="Length of --acceptance, min; a shorter one says less.",
 )
 @camera_options.mode
 @options.as_json

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     "--headset-cert",
     metavar="FILE",
     type=options.PATH,
-    help="Certificate of --headset.  [default: our own, made on first use]",
+    help="Certificate of --headset.  [default: one of its own, made on first use]",
 )
 @click.option("--headset-key", metavar="FILE", type=options.PATH, help="Key of --headset-cert.")
 @click.option(

@@ -34,6 +34,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--scene",
     required=True,
+    metavar="S",
     shell_complete=complete_scene,
     help="Room that is generated; see above.",
 )
@@ -46,7 +47,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
     help="An agent and its motion; see above. May be repeated.",
 )
 @click.option("--out", required=True, metavar="SESSION", type=options.PATH, help="A new folder.")
-@click.option("--seconds", type=float, default=30, help="Length of the session, s.")
+@click.option("--seconds", type=float, default=30, help="Length of the session, s, 3 to 3600.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the room and the noise.")
 @click.option(
     "--day",
@@ -62,14 +63,15 @@ class _Size(click.ParamType[tuple[float, ...]]):
     multiple=True,
     metavar="[NAME=]PROFILE[:MODE]",
     shell_complete=complete_profile,
-    help="Device that records: d435i, euroc, tumvi (fisheye) or a YAML file; MODE such as 848x480@30.",
+    help="Device that records: d435i, euroc, tumvi (fisheye) or a YAML file; MODE such as 848x480@30. "
+    "May be repeated.  [default: d435i; euroc for euroc:]",
 )
 @click.option(
     "--sensors",
     multiple=True,
     metavar="[NAME=]stereo|rgbd|mono",
-    help="stereo (infrared pair), rgbd (left image and depth) or mono (left image).  "
-    "[default: stereo; rgbd for robot:]",
+    help="stereo (infrared pair), rgbd (left image and depth) or mono (left image). May be "
+    "repeated.  [default: stereo; rgbd for robot:]",
 )
 @click.option(
     "--effect",
@@ -77,7 +79,7 @@ class _Size(click.ParamType[tuple[float, ...]]):
     multiple=True,
     metavar="KEY=VALUE",
     help="Sensor errors: none, noise=off, blur=off, drops=0.02, jitter_ms=1, time_offset_ms=5, … "
-    "(all: docs/understand/sensors.md).",
+    "(all: docs/understand/sensors.md). May be repeated.",
 )
 @click.option(
     "--images",

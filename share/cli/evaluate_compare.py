@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     "peers",
     multiple=True,
     metavar="NAME=PYTHON",
-    help=f"Python with {' or '.join(PEERS)} installed; may be repeated.  [default: the one running SHARE]",
+    help=f"Python with {' or '.join(PEERS)} installed. May be repeated.  [default: the one running SHARE]",
 )
 @click.option(
     "--vocabulary",

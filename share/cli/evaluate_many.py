@@ -76,7 +76,7 @@ def check_none_failed(succeeded: int, total: int) -> None:
     "policies_given",
     type=click.Choice(POLICY_NAMES),
     multiple=True,
-    help="A policy to compare; may be repeated.  [default: all that share a map]",
+    help="A policy to compare. May be repeated.  [default: all that share a map]",
 )
 @options.run_options
 @many_run_options
@@ -87,7 +87,8 @@ def check_none_failed(succeeded: int, total: int) -> None:
     multiple=True,
     metavar="PATH",
     type=click.Path(path_type=Path, exists=True),
-    help="Add to the report: a folder by `evaluate sweep`, or a file by `train compare --json`.",
+    help="Add to the report: a folder by `evaluate sweep`, or a file by `train compare --json`. May be "
+    "repeated.",
 )
 @options.config
 @options.out_folder

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     "scores_file",
     metavar="FILE",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Error models compared: a file by `train compare --json`.",
+    help="Add to the report: error models compared, a file by `train compare --json`.",
 )
 @options.workers
 @options.config

@@ -28,7 +28,7 @@ def keys() -> None:
 
 
 @keys.command(short_help="Generate this machine's key pair.")
-@click.option("--name", help="Name of the key pair.  [default: this machine's name]")
+@click.option("--name", metavar="NAME", help="Name of the key pair.  [default: this machine's name]")
 @options.keys
 @options.as_json
 def generate(name: str | None, keys: Path | None, as_json: bool) -> None:
@@ -58,7 +58,7 @@ def generate(name: str | None, keys: Path | None, as_json: bool) -> None:
     "agents",
     multiple=True,
     metavar="AGENT",
-    help="Name of an agent on that machine, if not NAME; may be repeated.",
+    help="Name of an agent on that machine, if not NAME. May be repeated.",
 )
 @click.option("--commands/--no-commands", default=None, help="Whether it may send robots.")
 @click.option("--objects/--no-objects", default=None, help="Whether it may place objects in the room.")

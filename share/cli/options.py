@@ -80,6 +80,8 @@ rotations = click.option(
     default="helical",
     help="Meaning of RX, RY, RZ in a Vicon CSV without RW: rotation vector (helical) or Euler angles (xyz).",
 )
+DISTANCE = "Largest distance from the cube at which the robot counts as there, m."
+TIMEOUT = "Longest time after the call in which the robot may come, s."
 POLICY_TEXTS = {
     "share": "rate of each agent by its quality of experience; merges with a small gain are skipped",
     "share-paper": "the paper's algorithm to the letter: no budget of the room, low QoE raises the rate",
@@ -141,7 +143,8 @@ frames = click.option("--frames", type=_Frames(), help="Use only camera frames A
 def explain_policies(command: Command) -> Command:
     """Add a line about each policy to the help of a command, before its example."""
     about, example, rest = cleandoc(command.__doc__ or "").partition("\b\nExample:")
-    rows = "\n".join(f"  {name:8}  {text}" for name, text in POLICY_TEXTS.items())
+    width = max(map(len, POLICY_TEXTS))
+    rows = "\n".join(f"  {name:{width}}  {text}" for name, text in POLICY_TEXTS.items())
     command.__doc__ = f"{about}\b\nPolicies:\n{rows}\n\n{example}{rest}"
     return command
 

@@ -31,7 +31,7 @@ _domain = click.option(
     help="The robot's DDS domain.",
 )
 _namespace = click.option(
-    "--namespace", default="", metavar="NAME", help="The robot's namespace, such as tb1.  [default: none]"
+    "--namespace", default="", show_default="none", metavar="NAME", help="The robot's namespace, such as tb1."
 )
 _agent = click.option(
     "--agent", metavar="NAME", help="The robot's agent.  [default: the first that sends poses]"
@@ -104,7 +104,11 @@ def robot() -> None:
 @_peers
 @_node
 @room_options.edge("Take goals from this edge too, as the robot of --name.")
-@click.option("--name", help="Name of the robot at the edge: that of its agent.")
+@click.option(
+    "--name",
+    metavar="NAME",
+    help="Name of the robot at the edge, which is its agent's.  [default: that of --agent]",
+)
 @options.keys
 @room_options.server_key
 def bridge(
@@ -220,7 +224,7 @@ def _poses_address(text: str) -> HostPort:
 @_poses
 @_agent
 @click.option(
-    "--seconds", default=90.0, show_default=True, help="How long you drive; Ctrl-C ends it earlier."
+    "--seconds", default=90.0, show_default=True, help="Length of the drive, s; Ctrl-C ends it earlier."
 )
 @_domain
 @_namespace

@@ -24,7 +24,11 @@ server_key = click.option(
     metavar="FILE|KEY",
     help="Public key of the edge; required for an edge on another machine. Turns on encryption.",
 )
-name = click.option("--name", help="Your name at the edge; its key has to be authorized for it.")
+name = click.option(
+    "--name",
+    metavar="NAME",
+    help="Your name at the edge, needed with --edge; your key has to be authorized for it.",
+)
 
 
 def edge(help_text: str, required: bool = False) -> Callable[[Any], Any]:

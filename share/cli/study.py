@@ -73,13 +73,25 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     "--space", type=_Numbers("x", "4x4"), default="4x4", metavar="WxD", help="Size of the floor, m."
 )
 @click.option(
-    "--corner", type=_Numbers(",", "-2,-2"), default="0,0", metavar="X,Y", help="Its least x and y, m."
+    "--corner",
+    type=_Numbers(",", "-2,-2"),
+    default="0,0",
+    metavar="X,Y",
+    help="Least x and y of the floor, m.",
 )
-@click.option("--spots", type=click.IntRange(1, 200), default=10, help="Spots to draw.")
+@click.option("--spots", type=click.IntRange(1, 200), default=10, help="Number of spots to draw.")
 @click.option(
-    "--margin", type=options.NumberRange(0, 100), default=0.5, help="From the edge of the floor, m."
+    "--margin",
+    type=options.NumberRange(0, 100),
+    default=0.5,
+    help="Least distance of spots from the floor's edge, m.",
 )
-@click.option("--apart", type=options.NumberRange(0, 100), default=0.8, help="Spots from each other, m.")
+@click.option(
+    "--apart",
+    type=options.NumberRange(0, 100),
+    default=0.8,
+    help="Least distance of spots from each other, m.",
+)
 @click.option(
     "--spots-file",
     metavar="FILE",
@@ -95,13 +107,15 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--questions", metavar="FILE", type=options.EXISTING_FILE, help="Questions of your own, YAML `questions`."
 )
-@click.option("--distance", type=options.NumberRange(0.01, 100), default=0.5, help="Of success, m.")
-@click.option("--timeout", type=options.NumberRange(0.1, 3600), default=30.0, help="Of success, s.")
+@click.option("--distance", type=options.NumberRange(0.01, 100), default=0.5, help=options.DISTANCE)
+@click.option("--timeout", type=options.NumberRange(0.1, 3600), default=30.0, help=options.TIMEOUT)
 @click.option(
-    "--seed", type=click.IntRange(0, 2**63), help="Of spots and orders, not letters.  [default: drawn]"
+    "--seed",
+    type=click.IntRange(0, 2**63),
+    help="Seed of spots and orders, not of letters.  [default: drawn]",
 )
 @click.option(
-    "--key", "key_file", metavar="FILE", type=options.PATH, help="The key.  [default: DIR-key.json]"
+    "--key", "key_file", metavar="FILE", type=options.PATH, help="File of the key.  [default: DIR-key.json]"
 )
 @options.out_folder
 @options.explain_policies
@@ -201,11 +215,13 @@ study.add_command(judge)
 
 
 @study.command(short_help="Tell the policies behind the letters, once all trials are done.")
-@click.argument("folder", type=options.PATH)
-@click.option("--key", "key_file", metavar="FILE", required=True, type=options.PATH, help="The plan's key.")
-@click.option("--early", is_flag=True, help="Although trials are missing; this is recorded.")
+@click.argument("folder", metavar="STUDY", type=options.PATH)
+@click.option(
+    "--key", "key_file", metavar="FILE", required=True, type=options.PATH, help="File of the plan's key."
+)
+@click.option("--early", is_flag=True, help="Unblind although trials are missing; this is recorded.")
 def unblind(folder: Path, key_file: Path, early: bool) -> None:
-    """Write the policies behind the letters to FOLDER/unblinded.json, for `share study analyze`.
+    """Write the policies behind the letters to STUDY/unblinded.json, for `share study analyze`.
 
     Refused while trials of the plan are missing, since a study is not blind any more then.
 
@@ -235,25 +251,33 @@ def unblind(folder: Path, key_file: Path, early: bool) -> None:
 
 
 @study.command(short_help="Compute a study's statistics.")
-@click.argument("data", metavar="FOLDER|CSV", type=click.Path(path_type=Path, exists=True))
+@click.argument("data", metavar="STUDY|CSV", type=click.Path(path_type=Path, exists=True))
 @click.option(
-    "--key", "key_file", metavar="FILE", type=options.PATH, help="The key: policies in place of letters."
+    "--key",
+    "key_file",
+    metavar="FILE",
+    type=options.PATH,
+    help="File of the key: policies stand in place of letters.",
 )
 @click.option(
     "--preferences",
     metavar="FILE",
     type=options.EXISTING_FILE,
-    help="With a CSV: CSV participant,most,least.",
+    help="With a CSV: a CSV file participant,most,least.",
 )
 @click.option(
     "--range",
     "ranges",
     multiple=True,
     metavar="NAME=LOW:HIGH",
-    help="With a CSV: the range of a measure, beyond which a value is an error; may be repeated.",
+    help="With a CSV: the range of a measure, beyond which a value is an error. May be repeated.",
 )
-@click.option("--distance", type=options.NumberRange(0.01, 100), help="Of success, m.  [default: the plan's]")
-@click.option("--timeout", type=options.NumberRange(0.1, 3600), help="Of success, s.  [default: the plan's]")
+@click.option(
+    "--distance", type=options.NumberRange(0.01, 100), help=f"{options.DISTANCE}  [default: the plan's]"
+)
+@click.option(
+    "--timeout", type=options.NumberRange(0.1, 3600), help=f"{options.TIMEOUT}  [default: the plan's]"
+)
 @click.option("--out", metavar="DIR", type=options.PATH, help="Folder for the report.")
 @options.as_json
 def analyze(
@@ -266,7 +290,7 @@ def analyze(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Compute the statistics of a study: of FOLDER, planned by `share study plan`, or of a CSV file with
+    """Compute the statistics of a study: of STUDY, a folder by `share study plan`, or of a CSV file with
     participant, condition, place (its number in the participant's order) and a column for each measure.
 
     By letters, until `share study unblind` or with --key. DIR gets report.html (opens offline), report.md,
@@ -288,7 +312,9 @@ def analyze(
         _refuse(preferences is not None or bool(ranges), "--preferences and --range are for a CSV file")
         table, rule = _study_table(data, key_file, distance, timeout)
     else:
-        _refuse(distance is not None or timeout is not None, "--distance and --timeout are for a FOLDER")
+        _refuse(
+            distance is not None or timeout is not None, "--distance, --timeout: only with a study's folder"
+        )
         table, rule = _csv_table(data, key_file, preferences, ranges), None
     found = analyse(table)
     files = [] if out is None else write_report(found, table, rule, out)

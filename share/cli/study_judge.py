@@ -24,7 +24,7 @@ _FAR_M = 0.5  # robot by the map and by the motion capture, at the median: the f
 
 
 @click.command(short_help="Judge a trial by motion capture in place of the map.")
-@click.argument("folder", metavar="DIR", type=options.PATH)
+@click.argument("folder", metavar="STUDY", type=options.PATH)
 @click.argument("trial", metavar="TRIAL")
 @click.option(
     "--mocap",
@@ -45,7 +45,8 @@ _FAR_M = 0.5  # robot by the map and by the motion capture, at the median: the f
 @click.option(
     "--zero",
     metavar="UTC",
-    help="When its clock was 0, such as 2026-11-28T10:03:12.34.  [default: found by the robot's motion]",
+    help="Time at which the motion capture's clock was 0, such as 2026-11-28T10:03:12.34.  "
+    "[default: found by the robot's motion]",
 )
 @options.rotations
 def judge(
@@ -58,12 +59,12 @@ def judge(
     zero: str | None,
     rotations: str,
 ) -> None:
-    """Judge TRIAL (such as p01-2) of the study in DIR by a motion capture of the robot.
+    """Judge TRIAL (such as p01-2) of STUDY by a motion capture of the robot.
 
     Put the body's pivot above the middle of the robot. The clocks need not agree: when the robot drives and
     stands tells the offset. Cubes count as lying at their planned spots; first motion, standstills, way and
-    distances are the motion capture's. The trial's events.jsonl is replaced, what the map said is kept beside
-    it, in events-map.jsonl; judging again begins from there.
+    distances are the motion capture's. The trial's events.jsonl is replaced; what the map said is kept beside
+    it, in events-map.jsonl, from which judging again begins.
 
     \b
     Example:  share study judge study p01-2 --mocap take7.csv --body Robot --floor FloorMarker --up y

@@ -25,11 +25,13 @@ _TOKEN = "page-token"  # in the study's folder
 
 
 @click.command(short_help="Lead the next participant through the trials.")
-@click.argument("folder", metavar="DIR", type=options.PATH)
+@click.argument("folder", metavar="STUDY", type=options.PATH)
 @click.argument("edge_options", metavar="[-- EDGE OPTIONS]", nargs=-1, type=click.UNPROCESSED)
-@click.option("--participant", metavar="NAME", help="Who.  [default: the next one with something left]")
 @click.option(
-    "--key", "key_file", metavar="FILE", type=options.PATH, help="The key.  [default: DIR-key.json]"
+    "--participant", metavar="NAME", help="Who takes part.  [default: the next one with trials left]"
+)
+@click.option(
+    "--key", "key_file", metavar="FILE", type=options.PATH, help="File of the key.  [default: STUDY-key.json]"
 )
 @click.option(
     "--page",
@@ -44,7 +46,7 @@ _TOKEN = "page-token"  # in the study's folder
 )
 @click.option("--resume", is_flag=True, help="Go on with a trial that was interrupted, without asking.")
 @click.option(
-    "--leave", is_flag=True, help="Mark it as not carried through instead, and go on with the next."
+    "--leave", is_flag=True, help="Mark an interrupted trial as not carried through, and go on with the next."
 )
 def run(
     folder: Path,
@@ -56,7 +58,7 @@ def run(
     resume: bool,
     leave: bool,
 ) -> None:
-    """Lead the next participant of the plan in DIR through the trials that are left, by letters.
+    """Lead the next participant of STUDY, a folder by `share study plan`, through the trials left.
 
     For each trial it starts the edge of that condition with EDGE OPTIONS, those of `share edge`; checks that
     agents, clocks, poses, robot and the floor's marker are well; shows spot after spot in the room; and sends

@@ -21,34 +21,37 @@ _SHARED_AGENTS = 12
 
 @click.command(short_help="Carry out a study with simulated participants.")
 @click.option("--participants", type=click.IntRange(1, 1000), default=20, help="Number of participants.")
-@click.option("--goals", type=click.IntRange(1, 50), default=10, help="Spots, each called once in a trial.")
 @click.option(
-    "--network",
+    "--goals", type=click.IntRange(1, 50), default=10, help="Number of spots, each called once in a trial."
+)
+@click.option(
+    "--link",
+    "network",
     metavar="NAME",
-    help="Network of each agent, as for `share evaluate run --link`.  [default: wifi5]",
+    help="Emulated network of each agent, as for `share evaluate run`.  [default: wifi5]",
 )
 @click.option(
     "--air",
     type=options.NumberRange(0.5, 1000),
     metavar="MBIT",
-    help="All share the air of one access point of so many Mbit/s.",
+    help="All agents share the air of one access point of so many Mbit/s, in place of --link.",
 )
 @click.option(
     "--agents",
     type=click.IntRange(3, 50),
-    help="On the network; those beyond participant, researcher and robot are replayed.  "
+    help="Agents on the network; those beyond participant, researcher and robot are replayed.  "
     f"[default: 3; {_SHARED_AGENTS} with --air]",
 )
-@click.option("--scene", default="warehouse", help="Room, as for `share emulate`.")
-@click.option("--mode", default="320x240@15", metavar="WxH@HZ", help="Pictures of all devices.")
-@click.option("--distance", type=options.NumberRange(0.01, 100), default=0.5, help="Of success, m.")
-@click.option("--timeout", type=options.NumberRange(0.1, 600), default=30.0, help="Of success, s.")
-@click.option("--seed", type=click.IntRange(0, 2**31), default=0, help="Of all that is drawn.")
-@click.option("--jobs", type=click.IntRange(1, 64), default=1, help="Processes, each with a trial.")
+@click.option("--scene", metavar="S", default="warehouse", help="Room, as for `share emulate`.")
+@click.option("--mode", default="320x240@15", metavar="WxH@HZ", help="Image size and rate of all devices.")
+@click.option("--distance", type=options.NumberRange(0.01, 100), default=0.5, help=options.DISTANCE)
+@click.option("--timeout", type=options.NumberRange(0.1, 600), default=30.0, help=options.TIMEOUT)
+@click.option("--seed", type=click.IntRange(0, 2**31), default=0, help="Seed of all that is drawn.")
+@click.option("--workers", type=click.IntRange(1, 64), default=1, help="Trials in parallel, each a process.")
 @click.option(
     "--scheduler",
-    metavar="tcp://HOST:PORT",
-    help="Spread trials over the workers of this dask scheduler, which share the disk.",
+    metavar="tcp://H:P",
+    help="Dask cluster that plays the trials; its workers share the disk.",
 )
 @click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print the results so far.")
 @options.out_folder
@@ -63,7 +66,7 @@ def simulate(
     distance: float,
     timeout: float,
     seed: int,
-    jobs: int,
+    workers: int,
     scheduler: str | None,
     only_table: bool,
     out: Path,
@@ -75,7 +78,7 @@ def simulate(
     key is DIR-key.json. An interrupted command goes on when it is run again (docs/do/study.md).
 
     \b
-    Example:  share study simulate --participants 12 --goals 5 --air 5 --jobs 8 --out simulated
+    Example:  share study simulate --participants 12 --goals 5 --air 5 --workers 8 --out simulated
               share study analyze simulated --key simulated-key.json --out report
     """
     from share.lab.evaluate.provenance import code_digest
@@ -83,7 +86,7 @@ def simulate(
     from share.lab.study.simulated_study import begin_study, key_path
 
     if network is not None and air is not None:
-        raise UsageError("--air: leave out --network, which is another way to say it")
+        raise UsageError("--air, --link: give one of them")
     settings = _settings(
         participants=participants,
         goals=goals,
@@ -99,7 +102,7 @@ def simulate(
     if study.missing() and not only_table:
         if study.code != code_digest():
             print_note(str(out), "was begun by another version of the program; its trials may differ")
-        _carry_out(study, jobs, scheduler)
+        _carry_out(study, workers, scheduler)
     for line in about_lines(study):
         click.echo(f"* {line}")
     click.echo(aligned_table(result_rows(study)))
@@ -107,13 +110,13 @@ def simulate(
     click.echo(f"study: {out}; statistics: share study analyze {out} --key {key} --out report")
 
 
-def _carry_out(study: SimulatedStudy, jobs: int, scheduler: str | None) -> None:
+def _carry_out(study: SimulatedStudy, processes: int, scheduler: str | None) -> None:
     """Carry out the missing trials; print the finished ones and an estimate of the time left."""
     from share.lab.evaluate.campaign import Cluster, worker_pool
     from share.lab.study.simulated_run import TimeLeft, estimated_s, run_missing
 
     pool: AbstractContextManager[Any] = (
-        Cluster(scheduler) if scheduler else worker_pool(jobs) or nullcontext()
+        Cluster(scheduler) if scheduler else worker_pool(processes) or nullcontext()
     )
     with pool as opened:
         workers = 1 if opened is None else opened.worker_count

@@ -36,7 +36,7 @@ def sync() -> None:
 
 
 @sync.command(short_help="Serve this machine's time to others.")
-@click.option("--bind", default=f"0.0.0.0:{PORT}", metavar="HOST:PORT", help="Address to listen on.")
+@click.option("--bind", default=f"0.0.0.0:{PORT}", metavar="H:P", help="Address to listen on (UDP).")
 @click.option(
     "--stratum",
     type=click.IntRange(1, 15),
@@ -93,13 +93,13 @@ def _counts_text(times: TimeServer) -> str:
 
 
 @sync.command(short_help="Measure the clock offsets of other machines.")
-@click.argument("hosts", nargs=-1, metavar="[HOSTS]")
+@click.argument("hosts", nargs=-1, metavar="[HOSTS]...")
 @click.option("--count", type=click.IntRange(1, 1000), default=8, help="Requests per host.")
 @click.option(
     "--limit-ms",
     type=click.FloatRange(0, min_open=True),
     default=1.0,
-    help="Largest allowed |offset| + uncertainty.",
+    help="Largest allowed |offset| + uncertainty, ms.",
 )
 @options.as_json
 def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) -> None:

@@ -223,7 +223,7 @@ def test_a_table_of_another_study_is_analysed(study, ratings):
         (["--range", "rating=5:1"], "is not NAME=LOW:HIGH", 2),
         (["--range", "mood=1:5"], "has no such measure; it has rating, time", 1),
         (["--range", "rating=1:5"], "is outside 1 to 5", 1),
-        (["--timeout", "3"], "--distance and --timeout are for a FOLDER", 2),
+        (["--timeout", "3"], "--distance, --timeout: only with a study's folder", 2),
         (["--key", "none.json"], "no such file", 2),
     ],
 )

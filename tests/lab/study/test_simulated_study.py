@@ -229,8 +229,8 @@ def simulate(out: Path, *more: str) -> Result:
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (("--network", "5g"), "network '5g' is not known; known: wifi5"),
-        (("--air", "5", "--network", "wifi5"), "leave out --network"),
+        (("--link", "5g"), "network '5g' is not known; known: wifi5"),
+        (("--air", "5", "--link", "wifi5"), "give one of them"),
         (("--agents", "2"), "2 is not in the range"),
         (("--air", "0"), "0 is not in the range"),
         (("--mode", "small"), "--mode small: expected WxH@HZ"),
