@@ -223,6 +223,16 @@ def test_help_explains_each_choice(name: str) -> None:
             assert not unexplained, f"{option.opts}: {unexplained}"
 
 
+@pytest.mark.parametrize("name", sorted(commands(cli)))
+def test_help_has_short_names_of_numbers_and_says_what_may_be_repeated(name: str) -> None:
+    command = commands(cli)[name]
+    given = [option for option in command.params if isinstance(option, click.Option)]
+    assert [one.opts for one in given if one.metavar is None and "range" in one.type.name] == []
+    named_by_all = "[NAME=]" if "with [NAME=] may be repeated" in f"{command.help}" else "\n"
+    repeated = [option for option in given if option.multiple and named_by_all not in f"{option.metavar}"]
+    assert [option.opts for option in repeated if "may be repeated" not in f"{option.help}".lower()] == []
+
+
 def test_help_of_emulate_has_every_scene() -> None:
     from share.lab.emulate.world.scenes import SCENES
 

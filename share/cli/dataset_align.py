@@ -83,6 +83,8 @@ def align(
 ) -> None:
     """Make one session for `share evaluate` from recordings of several devices and a motion capture of them.
 
+    Options with [NAME=] may be repeated, once a device.
+
     The clocks need not agree: the offset of each device is estimated from the rotation rates of device and
     body, and refused where it is ambiguous.
 

@@ -67,7 +67,7 @@ class _Numbers(click.ParamType[tuple[float, ...]]):
     "policies",
     multiple=True,
     type=click.Choice([name for name in POLICY_NAMES if name != STREAMED]),  # that builds no map
-    help="A condition; 2 to 8 of them.  [default: the paper's: share, covins-g, linear, equal]",
+    help="A condition. May be repeated: 2 to 8.  [default: the paper's: share, covins-g, linear, equal]",
 )
 @click.option(
     "--space", type=_Numbers("x", "4x4"), default="4x4", metavar="WxD", help="Size of the floor, m."
