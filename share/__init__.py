@@ -15,9 +15,12 @@ one):
     cli          one file a command
     lab          emulator, calibration, evaluation, training: what a headset never loads
     library      what `from share import` gives to programs
+    headset      the server of the page that wearers see
     runtime      the processes: agent, edge, mapper; status page
+    view         the live room
     cameras      live cameras
     store        the edge's map on disk
+    robot        a robot's place in the map, and its goals
     devices      checks of a device, clocks
     net          links between agents and edge, keys
     recordings   readers of recordings, sessions, calibration files
