@@ -54,7 +54,7 @@ def open_room(
     from share.runtime.room_link import RoomLink
 
     if name is None:
-        raise UsageError("--name is required with --edge: by it the edge knows who may what")
+        raise UsageError("--name is required with --edge: by the name the edge knows what you may do")
     return RoomLink(address, options.agent_name(name), read_keys(keys, server), **wants)
 
 
