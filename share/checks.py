@@ -13,7 +13,7 @@ MAX_ODOM_M = 1e4  # m from the odometry origin; map poses, composed of several, 
 MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
 MAX_SIGMA = 1e6  # of any quantity, in its unit
 MAX_MAP_ID_LENGTH = 96  # characters: a run's key has up to 81, a segment's number up to 11
-MAX_STAMP_NS = 2**62  # either side of 0: 146 years; differences fit 64 bits
+MAX_STAMP_NS = 2**62 - 1  # either side of 0: 146 years; differences fit 64 bits
 
 
 def checked_array(
@@ -44,6 +44,15 @@ def checked_pose(name: str, value: ArrayLike, max_m: float = MAX_POSITION_M) -> 
     T = checked_array(name, value, (4, 4), np.float64)
     check_poses(name, T[None], max_m)
     return T
+
+
+def is_pose(T: NDArray[np.floating[Any]]) -> bool:
+    """Return whether T (4, 4) is as `checked_pose` wants it."""
+    try:
+        checked_pose("pose", T)
+    except ValueError:
+        return False
+    return True
 
 
 def check_poses(name: str, poses: NDArray[np.floating[Any]], max_m: float = MAX_POSITION_M) -> None:

@@ -26,15 +26,32 @@ _TRIM_S = 60.0
 
 
 def prepare_process() -> None:
-    """Make the process end with the SHARE process that started it, and set thread counts and malloc
-    thresholds. Variables that the user has set stay."""
+    """Make the process end with the SHARE process that started it, open the standard streams that are closed,
+    and set thread counts and malloc thresholds. Variables that the user has set stay."""
     child_processes.exit_with_starter()
+    open_standard_streams()
     for name in _THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     if (mallopt := _glibc_function("mallopt")) is not None:
         mallopt(_M_MMAP_THRESHOLD, _MALLOC_THRESHOLD_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _MALLOC_THRESHOLD_BYTES)
+
+
+def open_standard_streams() -> None:
+    """Open the null device in place of the standard streams that are closed. Else their numbers go to the
+    next files or sockets, and what a library prints goes there too."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            if opened != number:
+                os.dup2(opened, number)
+                os.close(opened)
+    sys.stdin = sys.stdin or os.fdopen(0, closefd=False)
+    sys.stdout = sys.stdout or os.fdopen(1, "w", closefd=False)
+    sys.stderr = sys.stderr or os.fdopen(2, "w", closefd=False)
 
 
 class HeapTrimmer:

@@ -22,6 +22,7 @@ FOLDER = Path(__file__).with_name("page")
 MODULE = "main.js"
 ROOM_PATH = "/room"
 _MAX_FILE_BYTES = 2 * MB
+_HOST = re.compile(r"[\w.:%-]+|\[[\w.:%-]+\]", re.ASCII)
 _NAME = re.compile(r"[a-z\d][a-z\d_-]{0,60}\.[a-z\d]{2,6}")
 _TYPES = {
     "html": "text/html; charset=utf-8",
@@ -100,6 +101,8 @@ class PageGuard:
         name = (name if colon and port.isdecimal() else host).lower()
         if name in self._names:
             return True
+        if not _HOST.fullmatch(name):  # an address may have any text after a "%"
+            return False
         try:
             ip_address(name[1:-1] if name.startswith("[") and name.endswith("]") else name)
         except ValueError:

@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from share.checks import MAX_ID
 from share.earlier_poses import EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import Camera
@@ -49,7 +50,9 @@ class ReorderBuffer:
     def push(self, keyframe: Keyframe) -> list[Keyframe]:
         """Add a keyframe; return those that can be applied now, rising by id.
 
-        Raises ValueError if its id jumps by more than MAX_ID_GAP."""
+        Raises ValueError if its id jumps by more than MAX_ID_GAP, or no other could follow it."""
+        if keyframe.id >= MAX_ID:
+            raise ValueError(f"keyframe {keyframe.id}: there is no id for the next one")
         if keyframe.id > self.next_keyframe + MAX_ID_GAP:
             raise ValueError(f"keyframe {keyframe.id}: id jumps; expected about {self.next_keyframe}")
         if keyframe.id < self.next_keyframe:
@@ -142,24 +145,34 @@ _MAX_JUMP_M, _MAX_JUMP_M_S = 2.0, 10.0
 # headset's tilt converges.
 _MAX_MISMATCH_M, _MISMATCH_PER_M = 0.3, 0.05  # and what is added for each m of motion
 _MAX_MISMATCH_RAD = float(np.radians(12.0))
+_MAX_DRIFT_M = 1000.0  # between the composed motions of a segment and its poses; keeps map poses finite
 _MAX_VARIANCE = 100.0  # rad^2, m^2: as good as unknown; more would make the solver ill-conditioned
 
 
 @dataclass(frozen=True, eq=False)
 class OdometryBase:
-    """The newest applied keyframe: its id, its stamp, T_odom_body (4, 4), and the steps that led to it; None
-    where those are not known."""
+    """The newest applied keyframe: its id, its stamp, T_odom_body (4, 4), the steps that led to it, and
+    T_odom_moved (4, 4), T_odom_body by the composed motions since its segment's start; None where those are
+    not known."""
 
     id: int
     stamp_ns: int
     T_odom_body: F64
     steps: StepChain | None = None
+    T_odom_moved: F64 | None = None
 
     @classmethod
     def from_keyframe(cls, keyframe: Keyframe, base: OdometryBase | None = None) -> OdometryBase:
         """base: the run's keyframe before."""
-        steps = None if base is None or keyframe.reference < 0 else base.steps_to(keyframe)
-        return cls(keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body, steps)
+        id, stamp_ns, T_odom_body = keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body
+        if base is None or keyframe.reference < 0:
+            return cls(id, stamp_ns, T_odom_body)
+        return cls(id, stamp_ns, T_odom_body, base.steps_to(keyframe), base.moved_to(keyframe))
+
+    def moved_to(self, keyframe: Keyframe) -> F64:
+        """Return T_odom_body (4, 4) of the next keyframe by the composed motions."""
+        T_odom_moved = self.T_odom_body if self.T_odom_moved is None else self.T_odom_moved
+        return se3.orthonormal(T_odom_moved @ keyframe.T_ref_body)
 
     def steps_to(self, keyframe: Keyframe) -> StepChain:
         """Return the steps up to the next keyframe."""
@@ -180,7 +193,9 @@ class OdometryBase:
         mismatch_m, mismatch_rad = float(np.linalg.norm(T[:3, 3])), float(se3.rotation_angle(T))
         step_m = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
         if mismatch_m <= _MAX_MISMATCH_M + _MISMATCH_PER_M * step_m and mismatch_rad <= _MAX_MISMATCH_RAD:
-            return None
+            drift_m = float(np.linalg.norm(self.moved_to(keyframe)[:3, 3] - keyframe.T_odom_body[:3, 3]))
+            said = f"the motions since its segment's start and its pose differ by {drift_m:.0f} m"
+            return said if drift_m > _MAX_DRIFT_M else None
         mismatch_deg = np.degrees(mismatch_rad)
         return f"its motion and its two poses differ by {mismatch_m:.2g} m and {mismatch_deg:.2g} degrees"
 

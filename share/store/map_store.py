@@ -81,6 +81,7 @@ class MapStore:
             raise UsageError(f"{path}: a map cannot be made there: {reason}")
         if reason:
             return MapStore.read(path, reason)
+        database.refuse_hard_links(path)
         lock = database.lock_map(path)
         try:
             store = MapStore(path, read_and_repair(path), "")

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from share.agent_names import checked_run_key
-from share.checks import checked_cov, checked_id, checked_map_id, checked_pose
+from share.checks import checked_cov, checked_id, checked_map_id, checked_pose, is_pose
 from share.errors import StoreError
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import (
@@ -252,11 +252,16 @@ def read_view(row: Row) -> tuple[KeyframeKey, PackedView]:
 
 
 def read_poses(row: Row) -> SavePoses:
+    """Return the valid poses. Raises ValueError if there is none, or what is not one at all."""
     keys = _decode_pose_keys(row[0])
     T = _decode_array(row[1], len(keys), 4, 4)
-    for pose in T:
-        checked_pose("pose", pose)
-    return SavePoses(tuple(_checked_key(a, i) for a, i, _ in keys), T, tuple(name for *_, name in keys))
+    valid = [i for i, pose in enumerate(T) if is_pose(pose)]
+    if keys and not valid:
+        raise ValueError("poses: none is valid")
+    taken = [keys[i] for i in valid]
+    return SavePoses(
+        tuple(_checked_key(a, i) for a, i, _ in taken), T[valid], tuple(name for *_, name in taken)
+    )
 
 
 def _encode_message(message: messages.Message) -> bytes:

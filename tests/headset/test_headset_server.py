@@ -191,6 +191,8 @@ def test_files_come_with_a_strict_policy(served: HeadsetPage) -> None:
     assert headers["X-Content-Type-Options"] == "nosniff" and headers["X-Frame-Options"] == "DENY"
     assert get(served.endpoint, "/../settings/share/headset/headset.secret")[0] == 404
     assert get(served.endpoint, "/", Host="evil.example")[0] == 403
+    assert get(served.endpoint, "/", Host="[fe80::1%x;script-src *]")[0] == 403
+    assert get(served.endpoint, "/", Host="[fe80::1%eth0]")[0] == 200
     assert get(served.endpoint, "/room")[0] == 404
 
 

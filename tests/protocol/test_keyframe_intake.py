@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from helpers.hellos import hello_of
 
+from share.checks import MAX_ID
 from share.config import Config
 from share.earlier_poses import EarlierPoses
 from share.geometry.camera import Camera
 from share.mapping.corrections import MapEvent
 from share.protocol import edge_events as ed
 from share.protocol.edge import EdgeProtocol
-from share.protocol.keyframe_intake import OdometryBase, StepChain, sanitise
+from share.protocol.keyframe_intake import OdometryBase, ReorderBuffer, StepChain, sanitise
 from share.types import Keyframe, KeyframeImage, View
 from share.vision.image_codec import encode_jpeg
 from share.vision.keyframe_images import Surfaces
@@ -129,3 +130,35 @@ def test_a_suspicion_of_the_mapper_counts_as_one_of_the_intake() -> None:
     assert 0 < len(written) < 50
     ann = edge.report({})["agents"]["ann"]
     assert (ann["suspect_keyframes"], ann["last_suspicion"]) == (500, found.reason)
+
+
+def test_motions_that_drift_away_from_their_poses_start_a_segment() -> None:
+    """5 % of long steps are allowed; put together they would take the map beyond all measure."""
+    base, reasons, farthest_m = OdometryBase(0, 0, moved(-4500.0)), [], 0.0
+    for id in range(1, 60):
+        x = 4500.0 if id % 2 else -4500.0
+        sent = replace(keyframe(id, RIGHT), stamp_ns=id * 2000 * 10**9)
+        sent = replace(sent, T_odom_body=moved(x), T_ref_body=moved(2 * x + 425.0))
+        got, problem = sanitise(sent, base, CAMERA)
+        reasons += [] if problem is None else [problem]
+        base = OdometryBase.from_keyframe(got, base)
+        at = base.T_odom_body if base.T_odom_moved is None else base.T_odom_moved
+        farthest_m = max(farthest_m, float(np.abs(at[:3, 3]).max()))
+    assert farthest_m < 6000
+    assert len(reasons) > 10
+    assert "keyframe 3: the motions since its segment's start and its pose differ by 1275 m" in reasons[0]
+
+
+def moved(x: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def test_the_last_id_cannot_be_acknowledged_and_is_refused() -> None:
+    buffer = ReorderBuffer(MAX_ID - 2)
+    assert len(buffer.push(keyframe(MAX_ID - 1, RIGHT))) == 0  # waits for the one before
+    with pytest.raises(ValueError, match="there is no id for the next one"):
+        buffer.push(keyframe(MAX_ID, RIGHT))
+    assert len(buffer.push(keyframe(MAX_ID - 2, RIGHT))) == 2
+    assert buffer.ack().next_keyframe == MAX_ID

@@ -56,3 +56,19 @@ def test_an_ignored_hangup_stays_ignored() -> None:
         signal.raise_signal(signal.SIGHUP)
     assert calls == []
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+
+
+def test_a_terminate_after_a_hangup_ends_in_order_and_only_the_second_at_once() -> None:
+    """As systemd sends both: the second may be pending while the first is handled."""
+    calls, stop = counted()
+
+    def stop_while_another_comes() -> None:
+        stop()
+        if len(calls) == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    with stop_on_signal(stop_while_another_comes):
+        signal.raise_signal(signal.SIGHUP)
+        assert calls == [1, 1]
+        assert callable(signal.getsignal(signal.SIGTERM))  # no SIG_DFL, for one that is pending
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

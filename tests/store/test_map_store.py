@@ -28,9 +28,11 @@ from share.mapping.map_changes import (
     SaveCredential,
     SaveLink,
     SaveLoop,
+    SavePoses,
     SaveRun,
     with_unknown_credentials,
 )
+from share.protocol.peer import restored_runs
 from share.store import schema
 from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore, is_map
@@ -439,3 +441,45 @@ def test_a_file_size_limit_is_named(path, limit):
     assert done.stderr == ""
     assert "may not grow beyond the file size limit of this process" in done.stdout, done.stdout
     assert done.stdout.endswith("; raise it (ulimit -f) and start again\n")
+
+
+def test_one_pose_beyond_all_measure_costs_itself(path):
+    """And no run, no map: what an agent has sent must not cost others theirs."""
+    *changes, solved = small_map()
+    T = solved.T_map_body.copy()
+    T[1, 0, 3] = 2e5
+    with MapStore.open(path) as store:
+        store.write([*changes, replace(solved, T_map_body=T)])
+    kept = reopened(path)
+    assert kept.problems == ()
+    assert kept.poses is not None
+    assert set(kept.poses.keys) == {*solved.keys} - {solved.keys[1]}
+    assert len(restored_runs(kept, 0.05)) == len(kept.runs)
+
+
+def test_a_run_beyond_all_measure_waits_for_a_solution_and_others_have_their_place(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0)])
+    kept = reopened(path)
+    T_map_body, T_odom_body = np.eye(4), np.eye(4)
+    T_map_body[0, 3], T_odom_body[0, 3] = 9.9e4, -5e3
+    first = kept.keyframes[0]
+    far = replace(first, keyframe=replace(first.keyframe, T_odom_body=T_odom_body))
+    poses = SavePoses((far.keyframe_key,), T_map_body[None], (f"{ANN}/0",))
+    with_far = replace(kept, keyframes=(far, *kept.keyframes[1:]), poses=poses)
+    ann, bob = restored_runs(with_far, 0.05)
+    assert ann.last_correction_event is None
+    assert ann.next_keyframe == bob.next_keyframe == 1
+    assert bob.last_correction_event is not None
+
+
+def test_a_map_with_another_name_is_refused(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    other = path.with_name("other.sqlite")
+    os.link(path, other)
+    for name in (path, other):
+        with pytest.raises(StoreError, match=r"has 2 names \(hard links\)"):
+            MapStore.open(name)
+    other.unlink()
+    assert len(reopened(path).keyframes) > 0
