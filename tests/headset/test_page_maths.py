@@ -172,6 +172,22 @@ def test_history_interpolates(modules: BrowserPage, rng: np.random.Generator) ->
     assert found[2:] == [None, None, None]
 
 
+@pytest.mark.parametrize(
+    ("gap_ms", "after_ms", "is_known"),
+    [(100, 50, True), (120, 60, False), (250, 10, True), (250, 240, True), (250, 20, False), (310, 1, False)],
+)
+def test_between_distant_poses_only_what_is_near_one_is_known(
+    modules: BrowserPage, gap_ms: float, after_ms: float, is_known: bool
+) -> None:
+    script = """(() => {
+        const history = new m.ViewerHistory();
+        [1000, 1000 + gap].forEach((time) => history.add(time, Float64Array.from(pose)));
+        return history.at(1000 + after) !== null;
+    })()"""
+    pose = columns(np.eye(4))
+    assert run(modules, "viewer-history", script, gap=gap_ms, after=after_ms, pose=pose) == is_known
+
+
 def test_of_clock_samples_the_least_round_trip_counts(modules: BrowserPage) -> None:
     found = run(
         modules,

@@ -2,7 +2,10 @@
 import { fromPose, quaternionOf, slerp } from "./math.js";
 
 const KEPT = 256;  // two seconds at 120 Hz
-const MAX_GAP_MS = 100;  // between two poses; beyond, what was between them is not known
+// Interpolation errs by half the acceleration times the product of the times to both poses: 2.5e-3 s^2 is the
+// middle of 100 ms, or 10 ms beside a pose of 260 ms, with a page that draws few frames.
+const MAX_PRODUCT_MS2 = 2500;
+const MAX_GAP_MS = 300;  // between two poses
 
 export class ViewerHistory {
     #times = new Float64Array(KEPT);
@@ -36,7 +39,8 @@ export class ViewerHistory {
             const [i, j] = [(n - 1) % KEPT, n % KEPT];
             if (this.#times[i] > timeMs) continue;
             const gapMs = this.#times[j] - this.#times[i];
-            if (this.#times[j] < timeMs || gapMs > MAX_GAP_MS) return null;
+            const product = (timeMs - this.#times[i]) * (this.#times[j] - timeMs);
+            if (this.#times[j] < timeMs || gapMs > MAX_GAP_MS || product > MAX_PRODUCT_MS2) return null;
             const share = (timeMs - this.#times[i]) / gapMs;
             for (let c = 0; c < 3; c++) {
                 const from = this.#positions[3 * i + c];
