@@ -34,6 +34,7 @@ from raw_wire import Message, RawPeer, pack, unpack
 
 CONNECTIONS, RING, BATCH_S = 4, 400, 0.02
 HELLO_EVERY_S = 0.5  # of a run
+NOBODY_S = 60.0  # without a message that was taken, until an attacker gives up
 RENEWED = 0.02  # the share of batches before which a connection that mutates hellos is another run's
 SMALL_POINTS = 12  # of keyframes: it is their fields that are mutated; few bytes, many messages
 
@@ -162,7 +163,7 @@ class Attacker:
             due = min(args.count, int((time.monotonic() - began) * args.rate) + 1)
             if (batch := min(64, due - self.counts["sent"])) > 0 and self._send(batch):
                 last_alive = time.monotonic()
-            if time.monotonic() - last_alive > 8:
+            if time.monotonic() - last_alive > NOBODY_S:
                 break  # nobody is there any more
             self._pause(began, spent, due)
         seconds = time.monotonic() - began

@@ -62,9 +62,11 @@ def test_fuzz(kind: str, setup: Setup, form: Form, traffic: Path, tmp_path: Path
         keys = ["--keys=" + " ".join(edge.keys.of("eve"))] if edge.keys else []
         return siege.python("fuzzer.py", tmp_path / "fuzzer.log", edge.address, *arguments, *keys, *more)
 
-    most_s = 60 + 3 * form.count / form.rate
+    most_s = 120 + 6 * form.count / form.rate
     attacked = siege.stay(tmp_path / "attacked", setup, lambda edge: attack(edge, "--ring", ring), most_s)
     siege.judge(result, attacked)
+    if (sent := attacked.attack.get("sent", 0)) < form.count:
+        result.findings.append(f"only {sent} of {form.count} messages were taken: not a whole attack")
     if attacked.alive_s is None:
         busy = ("--valid", *_as_busy(attacked, form))
         control = siege.stay(tmp_path / "control", setup, lambda edge: attack(edge, *busy), most_s)
