@@ -19,8 +19,8 @@ from share.odometry import filter, initialisation, relocalisation, visual_update
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches
 from share.odometry.health import (
-    BLIND,
-    WEAK,
+    MIN_OK_FEATURES,
+    MIN_POSE_FEATURES,
     DivergenceMonitor,
     ImageImuConsistency,
     is_plausible,
@@ -50,7 +50,7 @@ from share.vision.orb import measures_depth
 
 _LONG_GAP_NS = 250_000_000  # between frames; integration over more is worse than the IMU's noise model says
 _MAX_IMU_WAIT_FRAMES = 10  # without an IMU sample, after which the tracker begins without IMU
-_MIN_PROVEN = WEAK // 2  # static features that are proven, without which no first pose is published
+_MIN_PROVEN = MIN_OK_FEATURES // 2  # proven static features, without which no first pose is published
 _ZERO_VELOCITY_SIGMA = 0.02  # m/s, at rest
 _MAX_UP_SIGMA_RAD = np.radians(3.0)  # tilt sigma up to which the up direction is published
 
@@ -202,7 +202,7 @@ class InertialTracker:
         landmarks = LandmarkMap(state, self._rig, self._config)
         self._imu.restart(state)
         self._keyframes.add_and_finish(frame, landmarks, self._imu.rate)
-        if len(state.feature_ids) < WEAK:
+        if len(state.feature_ids) < MIN_OK_FEATURES:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
         self._adopt_state(landmarks, new_segment=T_odom_cam is None)
         count = len(state.feature_ids)
@@ -256,7 +256,7 @@ class InertialTracker:
         imu = self._predict(frame, s)
         matches = landmarks.match_features(frame, last_frame.image0, interval_ns * 1e-9)
         visual_update.mark_dynamic(landmarks, matches, self._rig.cam0, self._imu.rate)
-        if self._rest.is_at_rest(s, matches.at, matches.is_found & ~matches.is_dynamic, imu.is_still):
+        if self._rest.is_at_rest(s, matches.uv, matches.is_found & ~matches.is_dynamic, imu.is_still):
             filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA)
         inliers, nis = self._update(landmarks, matches, interval_ns)
         count = int(inliers.sum())
@@ -264,7 +264,7 @@ class InertialTracker:
             self._imu.rate = mean_angular_rate(T_before, s.T, interval_ns)
         elif self._mono_window is None:
             self._consistency.add(nis, interval_ns * 1e-9)
-        is_textured = count >= BLIND or corners.count_fast(frame.image0) >= WEAK
+        is_textured = count >= MIN_POSE_FEATURES or corners.count_fast(frame.image0) >= MIN_OK_FEATURES
         if not self._check_health(s, matches, count, is_textured, interval_ns):
             return self._declare_lost(frame)
         state = self._track_state(s, count, imu)
@@ -334,7 +334,7 @@ class InertialTracker:
             cov = se3.compose_cov(se3.inverse(s.T_origin) @ s.T, self._start_cov, cov)
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
-            self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)
+            self._keyframes.add(frame, landmarks, self._imu.rate, count < MIN_OK_FEATURES, publish)
         is_ready = self._keyframes.is_ready
         return TrackResult(
             state,
@@ -364,7 +364,7 @@ class InertialTracker:
 
     def _sees_the_room(self, count: int) -> bool:
         is_static = self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
-        return is_static and count >= BLIND
+        return is_static and count >= MIN_POSE_FEATURES
 
     def _waiting_result(self, s: FilterState, count: int) -> TrackResult:
         if self._mono_window is not None:

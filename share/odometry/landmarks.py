@@ -30,7 +30,7 @@ from share.vision.depth import MIN_RHO
 from share.vision.keyframe_images import Surfaces
 from share.vision.orb import measures_depth
 
-LASTING_PX = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
+CORRELATED_SIGMA_PX = 0.3  # error of a feature that lasts: edges, patches seen from elsewhere
 _SPACING_PX = 18.0  # least distance between new features
 _GRAY_NOISE = 3.0  # gray levels of an image
 _MAX_PATCH_SIGMA_PX = 0.5  # error of a patch's position by image noise; with more it is no feature
@@ -172,13 +172,13 @@ class LandmarkMap:
         present state."""
         used = matches.is_found & ~matches.is_dynamic
         indices, in_cam1 = np.flatnonzero(used), None
-        measured_uv = matches.at[indices]
+        measured_uv = matches.uv[indices]
         if (stereo := matches.cam1) is not None:
             used_in_cam1 = used[stereo.feature]
             cam1_indices = stereo.feature[used_in_cam1]
             in_cam1 = np.arange(len(indices) + len(cam1_indices)) >= len(indices)
             indices = np.concatenate([indices, cam1_indices])
-            measured_uv = np.concatenate([measured_uv, stereo.at[used_in_cam1]])
+            measured_uv = np.concatenate([measured_uv, stereo.uv[used_in_cam1]])
         order = np.argsort(self.state.anchor[indices], kind="stable")
         in_cam1 = None if in_cam1 is None else in_cam1[order]
         return self._with_inflated_noise(
@@ -199,7 +199,7 @@ class LandmarkMap:
             predicted, uv = self._in_image_plane(
                 predicted, uv, np.zeros(len(indices), bool) if in_cam1 is None else in_cam1
             )
-        sigma, correlated_sigma = self.sigma_px / focal, LASTING_PX / focal
+        sigma, correlated_sigma = self.sigma_px / focal, CORRELATED_SIGMA_PX / focal
         return filter.feature_measurements(s, indices, predicted, uv, sigma, correlated_sigma, rate)
 
     def _in_image_plane(
@@ -318,7 +318,7 @@ class LandmarkMap:
         )
         matches = feature_matching.match_features(frame, self._rig, means, dormant.appearance, cam0_only=True)
         found = np.flatnonzero(matches.is_found)
-        rows = self._measurements(means, found, matches.at[found], None, rate)
+        rows = self._measurements(means, found, matches.uv[found], None, rate)
         recognised = found[dormant_features.nis(self.state, rows, dormant.sigma[found]) < filter.GATE]
         dormant.appearance.last_px[recognised] = matches.px[recognised]
         return dormant.take(recognised)

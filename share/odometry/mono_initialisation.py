@@ -12,7 +12,7 @@ from share.geometry.camera import Camera, ImuNoise, rays
 from share.odometry import filter, mono_bundle
 from share.odometry.feature_matching import anchors_in_camera
 from share.odometry.initial_depth import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
-from share.odometry.landmarks import LASTING_PX, LandmarkMap
+from share.odometry.landmarks import CORRELATED_SIGMA_PX, LandmarkMap
 from share.odometry.mono_bundle import FRAME_SIZE, BundleModel, BundleSolution, WindowFrame
 from share.odometry.state import CORE_SIZE, EXTRINSIC, ORIGIN, FilterState
 from share.odometry.visual_update import COMMON_COV
@@ -35,7 +35,7 @@ class MonoWindow:
     """Frames since the first keyframe."""
 
     def __init__(self, first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig) -> None:
-        sigma = _NOISE_SCALE * float(np.hypot(config.sigma_px, LASTING_PX)) / camera.focal
+        sigma = _NOISE_SCALE * float(np.hypot(config.sigma_px, CORRELATED_SIGMA_PX)) / camera.focal
         self._first, self._camera = copy.deepcopy(first), camera
         self._model = BundleModel(
             noise, config.gravity, sigma, COMMON_COV, MEAN_RHO, ROOM_LOG_SIGMA, FEATURE_SPREAD
