@@ -67,8 +67,10 @@ class ImuInflation:
 
 @dataclass(frozen=True, eq=False)
 class _RejectedSample:
-    """A rejected, suspect or retracted sample: the axes (6,) to ignore, its deviation (6,) and how long
-    that may last."""
+    """A rejected, suspect or retracted sample.
+
+    axes (6,): to ignore. excess (6,): its deviation, rad/s and m/s^2. duration_ns: how long that may last.
+    """
 
     stamp_ns: int
     axes: NDArray[np.bool_]
@@ -154,7 +156,7 @@ class ImuOutlierDetector:
             stamp_ns = int(stamps_ns[k])
             self._restart_after_gap(stamp_ns)
             if self._restart_window is None:
-                accepted[k] = self._check_sample(stamp_ns, self._newest, values[k])
+                accepted[k] = self._check_sample(stamp_ns, values[k])
                 k += 1
             else:
                 end = _end_before_gap(stamps_ns, k, _MAX_CHAIN_WINDOW - len(self._restart_window.stamps))
@@ -240,7 +242,7 @@ class ImuOutlierDetector:
                 )
                 self._note_newest(int(stamps[first]), all_values[first])
             for n in range(max(0, first - known_count + 1), len(values)):
-                accepted[n] = self._check_sample(int(stamps_ns[n]), self._newest, values[n])
+                accepted[n] = self._check_sample(int(stamps_ns[n]), values[n])
         self._extend_restart(window, stamps_ns, values, accepted)
         return accepted
 
@@ -309,9 +311,10 @@ class ImuOutlierDetector:
                 _RejectedSample(now_ns, _NO_AXES, np.abs(window.values[n] - reference), step_ns)
             )
 
-    def _check_sample(self, stamp_ns: int, newest: tuple[int, F64] | None, value: F64) -> bool:
-        """Return whether the sample is accepted."""
-        assert newest is not None
+    def _check_sample(self, stamp_ns: int, value: F64) -> bool:
+        """Return whether the sample, not the first of all, is accepted."""
+        assert self._newest is not None
+        newest = self._newest
         self._note_newest(stamp_ns, value)
         step_ns = stamp_ns - newest[0]
         step = np.abs(value - self._accepted_value)
@@ -357,7 +360,7 @@ class ImuOutlierDetector:
         self._run_steps.clear()
 
     def _extend_run(self, stamp_ns: int, value: F64, step: F64) -> None:
-        """Accept this sample; a run of outliers, some of which fit by chance, goes on."""
+        """Accept this sample. A run of outliers that has just paused goes on: some of them fit by chance."""
         if self._run_start_ns is None or stamp_ns - self._run_end_ns > _MAX_GAP_NS:
             self._restart_from(
                 stamp_ns, value, np.concatenate([self._recent_steps, step[None]])[-_RECENT_STEPS:]

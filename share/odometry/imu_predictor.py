@@ -150,15 +150,18 @@ def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
 
 
 _MAX_REST_RATE = 0.03  # rad/s
-_SILENT_NS = 100_000_000  # the IMU counts as silent after this long without a sample; then
-_TURNING_NOISE = 0.5  # rad/s/sqrt(Hz) is the process noise of the angular rate,
-_MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz) that of the velocity
+_SILENT_NS = 100_000_000  # time without a sample after which the IMU counts as silent
+# Process noise of a prediction at constant velocity: of the angular rate and of the velocity.
+_TURNING_NOISE = 0.5  # rad/s/sqrt(Hz)
+_MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz)
 
 
-class ImuUse(NamedTuple):
-    """The basis of a prediction: has_gyro, the gyro measured all axes; has_samples, the IMU was not
-    silent; has_rejected, some of its samples were rejected; is_still, it measured what it does at rest and at
-    constant velocity."""
+class ImuStatus(NamedTuple):
+    """What the IMU gave for a prediction.
+
+    has_samples: it was not silent. has_gyro: its gyroscope measured all axes. has_rejected: some samples were
+    rejected. is_still: it measured what it does at rest, or at constant velocity.
+    """
 
     has_gyro: bool
     has_samples: bool
@@ -185,7 +188,7 @@ class ImuPredictor:
         gyro = self.buffer.samples.gyro
         self.rate = gyro[-1] - state.bg if len(gyro) else np.zeros(3)
 
-    def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuUse:
+    def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuStatus:
         """Propagate the state to `to_ns`, IMU time.
 
         gyro_only: at constant velocity, for a single camera whose scale is unknown.
@@ -193,18 +196,18 @@ class ImuPredictor:
         inflation = self.buffer.inflation(s.stamp_ns, to_ns)
         has_rejected = inflation is not None and bool(inflation.rejected_axes.any())
         if to_ns <= s.stamp_ns:
-            return ImuUse(True, True, has_rejected)
+            return ImuStatus(True, True, has_rejected)
         samples, gravity = self.samples(s.stamp_ns, to_ns), self._gravity
         if samples is None:
             substitute = constant_velocity_samples(s, self.rate, to_ns, gravity)
             filter.propagate(s, substitute, to_ns, self._constant_velocity, gravity)
-            return ImuUse(False, False, has_rejected)
+            return ImuStatus(False, False, has_rejected)
         if gyro_only:
             noise = noise_without_axes(self.noise, self._constant_velocity, np.arange(6) >= 3)
             self.rate = filter.propagate(
                 s, gyro_only_samples(s, samples, to_ns, gravity), to_ns, noise, gravity
             )
-            return ImuUse(True, True, has_rejected)
+            return ImuStatus(True, True, has_rejected)
         is_clipped = self.buffer.is_clipped(samples)
         silent_axes = is_clipped if inflation is None else is_clipped | inflation.rejected_axes
         noise = noise_with_vibration(self.noise, self.buffer.latest(to_ns))
@@ -214,7 +217,7 @@ class ImuPredictor:
         if inflation is not None:
             filter.inflate(s, inflation.turn_rad, 0.0, inflation.speed_m_s)
         is_still = inflation is None and self._is_still(to_ns)
-        return ImuUse(not silent_axes[:3].any(), True, has_rejected, is_still)
+        return ImuStatus(not silent_axes[:3].any(), True, has_rejected, is_still)
 
     def _is_still(self, now_ns: int) -> bool:
         return bool(np.linalg.norm(self.rate) < _MAX_REST_RATE) and self.buffer.is_still(now_ns)

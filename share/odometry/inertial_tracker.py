@@ -26,7 +26,7 @@ from share.odometry.health import (
     is_plausible,
     pose_state,
 )
-from share.odometry.imu_predictor import ImuPredictor, ImuUse, mean_angular_rate
+from share.odometry.imu_predictor import ImuPredictor, ImuStatus, mean_angular_rate
 from share.odometry.keyframes import KeyframeWork
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
@@ -141,8 +141,8 @@ class InertialTracker:
     def finish_keyframe(self) -> None:
         """Run a slice of the pending keyframe work: new features, the local map.
 
-        Call it when the pose, and the candidate if there is one, are sent; otherwise the next `track` calls
-        it first.
+        Call it when the pose, and the keyframe if one is ready, are sent; otherwise the next `track` calls it
+        first.
         """
         if self._landmarks is None or self._last_frame is None or self._is_finished:
             return
@@ -279,7 +279,7 @@ class InertialTracker:
         found_count = int((matches.is_found | inliers).sum())
         return replace(result, found_count=found_count, median_nis=finite_median(nis))
 
-    def _predict(self, frame: Frame, s: FilterState) -> ImuUse:
+    def _predict(self, frame: Frame, s: FilterState) -> ImuStatus:
         """Propagate the state to the time of the frame's image."""
         image_ns = frame.stamp_ns + round(s.timeshift_s * 1e9)  # IMU time
         return self._imu.predict(s, image_ns, gyro_only=self._mono_window is not None)
@@ -348,7 +348,7 @@ class InertialTracker:
             angular_velocity=self._imu.rate.copy(),
         )
 
-    def _track_state(self, s: FilterState, count: int, imu: ImuUse) -> TrackState:
+    def _track_state(self, s: FilterState, count: int, imu: ImuStatus) -> TrackState:
         has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)
         if self._mono_window is not None or (
             has_imu and not self._has_published and not self._is_publishable(s, count)

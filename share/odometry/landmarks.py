@@ -35,13 +35,13 @@ _SPACING_PX = 18.0  # least distance between new features
 _GRAY_NOISE = 3.0  # gray levels of an image
 _MAX_PATCH_SIGMA_PX = 0.5  # error of a patch's position by image noise; with more it is no feature
 _AVOID_FRAMES = 30  # for which no feature is searched where a dynamic feature was
-_MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution,
-_CAUTION_FRAMES = 60  # frames of it after the last such frame
+_MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution
+_CAUTION_FRAMES = 60  # length of that time, after the last such frame
 _PROBATION_S = 0.34  # after which a static feature is proven
 _SUSPECT_NOISE_SCALE = 5.0  # of the sigma of a feature that may move
 _UNKNOWN_BIAS_SIGMA = 2e-3  # rad/s, of the gyroscope; with more, rotation may pass for translation
 _NEAR_RATIO = 2.0  # of a near feature's inverse depth to the median
-_MAX_NEAR_SHARE = 0.25  # of the features; more than these are a part of the room
+_MAX_NEAR_SHARE = 0.25  # of the features; if more are near, they are a part of the room
 _SLANT_PERIOD = 4  # frames between updates of a feature's slant
 _MIN_DEPTH_M = 0.2
 _UNKNOWN_RHO_SIGMA = 0.05  # 1/m; half a pixel a frame at walking speed
@@ -254,26 +254,19 @@ class LandmarkMap:
     def find_corners(self, frame: Frame, occupied_px: F32, peaks: CornerPeaks | None = None) -> F32:
         """Return px (N, 2) of corners for new features of a keyframe, away from occupied_px (M, 2), best
         first; peaks: of its image, if some are known."""
-        max_count = self._config.features if self.has_free_slots() else 0
+        max_count = self._config.features if self.free_slots() else 0
         mask = field_mask(self._rig.cam0)
         return corners.detect(frame.image0, occupied_px, max_count, _SPACING_PX, mask, peaks)
 
-    def has_free_slots(self) -> bool:
-        """Return whether features may be added."""
-        return self._free_slots() > 0
+    def free_slots(self) -> int:
+        """Return the number of features that may be added."""
+        return max(self._config.features - len(self.state.feature_ids), 0)
 
     def admit_features(self, frame: Frame, keyframe_id: int, px: F32) -> None:
         """Add features at px (N, 2) of `frame`, the keyframe with this id; the last frame may be a later
         one."""
-        anchor, free_slots = filter.keyframe_index(self.state, keyframe_id), self._free_slots()
-        self._add_features(frame, anchor, px[:free_slots])
-
-    def _free_slots(self) -> int:
-        """Return the number of features that may be added."""
-        return max(self._config.features - len(self.state.feature_ids), 0)
-
-    def _add_features(self, frame: Frame, anchor: int, px: F32) -> None:
-        camera, s = self._rig.cam0, self.state
+        camera, s, px = self._rig.cam0, self.state, px[: self.free_slots()]
+        anchor = filter.keyframe_index(s, keyframe_id)
         ray = camera.normalise(px.astype(np.float64))
         prior = initial_depth.initial_depths(frame, self._rig, s, px, ray, self.appearance.last_px)
         appearance = feature_appearance.extract_appearance(
@@ -363,9 +356,9 @@ class LandmarkMap:
 
 
 def _near_few(rho: F64) -> NDArray[np.bool_]:
-    """Return which features (N,) with inverse depths rho are much nearer than most, if they are few.
+    """Return which features (N,) with inverse depths rho are much nearer than most; none if they are many.
 
-    They say the most about translation: one who stands before the camera and sways outweighs a room.
+    Near features say the most about translation: a person who sways before the camera outweighs the room.
     """
     if not len(rho):
         return np.zeros(0, bool)
