@@ -1,4 +1,5 @@
-"""Keeps agents that disagree with the others out of their maps, or takes them out when the evidence is late.
+"""Keeps agents that disagree with the others out of their maps, and removes them where the evidence comes
+later.
 
 Small scale errors are corrected, and understated variances enlarged.
 """
@@ -200,11 +201,11 @@ class Quarantine:
         Those still forbidden are withdrawn again, while their keyframes exist.
         """
         odometry, decisions = self._graph.odometry, list[LoopDecision]()
-        most_comparisons = self._loop_acceptance.comparison_count + _COMPARED_AT_ONCE
+        max_comparisons = self._loop_acceptance.comparison_count + _COMPARED_AT_ONCE
         while (
             self._to_reconsider
             and len(decisions) < _RECONSIDERED_AT_ONCE
-            and self._loop_acceptance.comparison_count < most_comparisons
+            and self._loop_acceptance.comparison_count < max_comparisons
         ):
             loop = self._to_reconsider.pop(0)
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):
