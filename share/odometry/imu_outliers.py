@@ -1,5 +1,4 @@
-"""Reject IMU samples that no motion of a body explains: runs of wrong samples, up to a fifth of a second
-long.
+"""Reject IMU samples that no motion of a body explains, in runs of up to a fifth of a second.
 
 `share.sensors.imu_check` removes certain glitches: up to three samples with neighbours on both sides. This
 detector does not wait for later samples, so a rejected sample may be true: a knock looks the same at first.
@@ -44,8 +43,8 @@ _MAX_HISTORY = 4096  # rejected samples; an IMU gives fewer in that time
 _NO_AXES = np.zeros(6, np.bool_)
 _MIN_CHAIN = 3  # a shorter chain is also compared with the last sample before the gap
 _MAX_NOISE_STEP = _STEP_MARGIN / _STEP_RATIO  # the largest recent step assumed where none is known
-_CERTAIN_CHAIN = 12  # accepted samples that end a restart,
-_CERTAIN_SHARE = 2 / 3  # if they are this share of its samples
+# A restart ends once so many samples are accepted, and they are this share of all its samples.
+_CERTAIN_CHAIN, _CERTAIN_SHARE = 12, 2 / 3
 _MAX_RESTART = 40  # samples of a restart
 _MAX_CHAIN_WINDOW = 64  # samples of a restart, with those of the newest frame
 _MAX_TURN_RAD = 0.3  # bound of the inflation of attitude
@@ -80,8 +79,7 @@ class _RejectedSample:
 
 @dataclass(eq=False)
 class _RestartWindow:
-    """Samples since the first one, or since the first after a gap: stamps, values (6,), and which are
-    accepted.
+    """Samples since the first, or the first after a gap: stamps, values (6,), and which are accepted.
 
     before_gap: stamp and value of the last accepted sample before the gap, if there was one.
     """
@@ -370,8 +368,7 @@ class ImuOutlierDetector:
 
 
 def _end_before_gap(stamps_ns: I64, first: int, max_count: int) -> int:
-    """Return the end of the samples from index `first` on without a gap between them, at most `max_count`
-    of them."""
+    """Return the end of the samples from index `first` on without a gap, of at most `max_count` of them."""
     near = np.diff(stamps_ns[first : first + max_count]) <= _MAX_GAP_NS
     return first + 1 + (len(near) if near.all() else int(near.argmin()))
 

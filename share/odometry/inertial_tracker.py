@@ -46,7 +46,7 @@ from share.types import (
     WaitReason,
 )
 from share.vision import corners
-from share.vision.orb import measures_depth
+from share.vision.depth import measures_depth
 
 _LONG_GAP_NS = 250_000_000  # between frames; integration over more is worse than the IMU's noise model says
 _MAX_IMU_WAIT_FRAMES = 10  # without an IMU sample, after which the tracker begins without IMU
@@ -168,7 +168,7 @@ class InertialTracker:
     @property
     def rejected_imu_samples(self) -> int:
         """The number of IMU samples rejected."""
-        return self._imu.buffer.rejected_count
+        return self._imu.buffer.outliers.rejected_count
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """Return T_odom_body (4, 4) at a time after the last frame's, IMU time, for renderers between frames;
@@ -290,7 +290,7 @@ class InertialTracker:
         """Update state and features with the matches. Return the inliers (N,) and the NIS of the
         measurements."""
         is_after_gap = interval_ns > _LONG_GAP_NS
-        is_suspect = self._imu.buffer.is_suspect(landmarks.state.stamp_ns)
+        is_suspect = self._imu.buffer.outliers.is_suspect(landmarks.state.stamp_ns)
         inliers, nis = visual_update.update(
             landmarks, matches, self._rig.cam0, self._imu.rate, is_after_gap, is_suspect
         )

@@ -26,9 +26,8 @@ from share.odometry.state import GYRO_BIAS, FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import CornerPeaks, field_mask
-from share.vision.depth import MIN_RHO
+from share.vision.depth import MIN_RHO, measures_depth
 from share.vision.keyframe_images import Surfaces
-from share.vision.orb import measures_depth
 
 CORRELATED_SIGMA_PX = 0.3  # error of a feature that lasts: edges, patches seen from elsewhere
 _SPACING_PX = 18.0  # least distance between new features

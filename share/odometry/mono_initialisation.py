@@ -24,9 +24,10 @@ _MIN_FRAMES = 12  # before the first fit
 _MIN_PARALLAX_PX = 2.0  # of at least a quarter of the features, without rotation, for a fit
 _MAX_WINDOW_NS = 2_500_000_000
 _NOISE_SCALE = 2.0  # of a coordinate's sigma, because errors of a patch last from frame to frame
-_MAX_SCALE_SIGMA = 0.03  # relative, for a fit to be accepted,
-_MIN_BASELINE_PX = 15.0  # baseline over depth, times the focal length,
-_MAX_COST = 1.0  # and mean cost of an observation, squared sigmas
+# A fit is accepted with
+_MAX_SCALE_SIGMA = 0.03  # relative
+_MIN_BASELINE_PX = 15.0  # baseline over depth, times the focal length
+_MAX_COST = 1.0  # mean of an observation, squared sigmas
 _UNKNOWN_SCALE_SIGMA = 0.1  # relative
 _GAUGE_SIGMA = 1e-3  # rad, 1/m
 

@@ -43,8 +43,8 @@ from share.types import (
 )
 from share.vision import corners, optical_flow
 from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
+from share.vision.depth import measure_depth
 from share.vision.keyframe_images import Surfaces
-from share.vision.orb import measure_depth
 
 KEYFRAME_M, KEYFRAME_RAD = 0.15, 0.15  # motion since the last keyframe that triggers a new one
 _UP_SIGMA_RAD = float(np.radians(3.0))  # of a keyframe's up, which is 0: not known
