@@ -248,7 +248,7 @@ class Atlas:
         self.solving.forget_all_but(graph.odometry.live_segments)
         live = {graph.reference_segments[segment] for segment in graph.odometry.live_segments}
         graph.unsolved_maps = dict.fromkeys(
-            reference_segment for reference_segment in graph.unsolved_maps if reference_segment in live
+            reference for reference in graph.unsolved_maps if reference in live
         )
         self.loop_acceptance.remove_keyframes({out.key for out in removed})
         self.quarantine.agreement.remove_nodes([out.node_id for out in removed], graph.odometry.live_segments)

@@ -107,20 +107,14 @@ class KeyframeCulling:
 
     def _choose_with(self, count: int, reserve: ReturnReserve) -> InSlices[list[int]]:
         maps = self._segments_by_map()
-        finished = [
-            reference_segment
-            for reference_segment, segments in maps.items()
-            if self._is_finished(segments, reserve)
-        ]
-        ongoing = [reference_segment for reference_segment in maps if reference_segment not in set(finished)]
+        finished = [reference for reference in maps if self._is_finished(maps[reference], reserve)]
+        ongoing = [reference for reference in maps if reference not in set(finished)]
         protected = yield from self._protected(ongoing, reserve)
         quotas, out = self._quotas(count, protected), dict[int, None]()
-        for reference_segment in (*finished, *ongoing):
-            yield from self._add_redundant(
-                maps[reference_segment], protected, quotas, out, _SAME_PLACE_DISTANCE
-            )
-        for reference_segment in (*reversed(finished), *ongoing):
-            yield from self._add_redundant(maps[reference_segment], protected, quotas, out)
+        for reference in (*finished, *ongoing):
+            yield from self._add_redundant(maps[reference], protected, quotas, out, _SAME_PLACE_DISTANCE)
+        for reference in (*reversed(finished), *ongoing):
+            yield from self._add_redundant(maps[reference], protected, quotas, out)
         return list(out)
 
     def _add_redundant(

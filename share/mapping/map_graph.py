@@ -268,10 +268,8 @@ class MapGraph:
 
     def rescale_odometry(self, agent: str, log_scale: float, covariance_scale: float) -> None:
         """Set an agent's log scale and covariance scale; its maps need to be solved again."""
-        log_change, covariance_ratio = (
-            log_scale - self.log_scales.get(agent, 0.0),
-            covariance_scale / self.covariance_scales.get(agent, 1.0),
-        )
+        log_change = log_scale - self.log_scales.get(agent, 0.0)
+        covariance_ratio = covariance_scale / self.covariance_scales.get(agent, 1.0)
         self.log_scales[agent], self.covariance_scales[agent] = log_scale, covariance_scale
         for segment_index, segment in enumerate(self.odometry.segments):
             if segment.agent != agent or not segment.nodes:

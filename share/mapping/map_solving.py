@@ -105,10 +105,7 @@ class MapSolving:
 
     def due_maps(self) -> list[str]:
         """Names of maps that changed since their last job, longest waiting first."""
-        return [
-            self._graph.odometry.segments[reference_segment].name
-            for reference_segment in self._graph.unsolved_maps
-        ]
+        return [self._graph.odometry.segments[reference].name for reference in self._graph.unsolved_maps]
 
     def make_job(self, map_id: str) -> SolveJob:
         """Return the solver job of a map. Raises ValueError if there is no such map."""

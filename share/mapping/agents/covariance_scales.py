@@ -164,11 +164,7 @@ class CovarianceScales:
 
     def drop_evidence(self, segment_pairs: Iterable[SegmentPair]) -> None:
         """Drop the evidence of these segments: their odometries contradict, or are removed."""
-        dropped = [
-            segment_pair
-            for segment_pair in segment_pairs
-            if self.evidence.pop(segment_pair, None) is not None
-        ]
+        dropped = [pair for pair in segment_pairs if self.evidence.pop(pair, None) is not None]
         if dropped:
             self._estimate()
 
@@ -176,20 +172,11 @@ class CovarianceScales:
         """Drop the evidence of these agents, and compare no stated covariances with theirs."""
         if self.stated.exclude(agents):
             self._estimate()
-        self.drop_evidence(
-            [
-                segment_pair
-                for segment_pair, evidence in self.evidence.items()
-                if set(evidence.agents) & set(agents)
-            ]
-        )
+        excluded = set(agents)
+        self.drop_evidence([pair for pair, one in self.evidence.items() if excluded & set(one.agents)])
 
     def remove_agent(self, agent: str) -> None:
-        self.evidence = {
-            segment_pair: evidence
-            for segment_pair, evidence in self.evidence.items()
-            if agent not in evidence.agents
-        }
+        self.evidence = {pair: one for pair, one in self.evidence.items() if agent not in one.agents}
         self.stated.remove_agent(agent)
         self._estimate()
         self.scales.pop(agent, None)

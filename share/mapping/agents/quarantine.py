@@ -100,15 +100,11 @@ class Quarantine:
 
     def separation_reason(self, loop: Loop) -> str:
         """Why the loop must not be accepted: it would connect agents kept in separate maps; else empty."""
-        reference_segments = self._graph.reference_segment(loop.a), self._graph.reference_segment(loop.b)
-        if reference_segments[0] == reference_segments[1]:
+        first, second = (self._graph.reference_segment(key) for key in (loop.a, loop.b))
+        if first == second:
             return ""
-        first_agents, second_agents = (
-            self._agents_in_map(reference_segment) for reference_segment in reference_segments
-        )
-        return self.agreement.unverified_reason(
-            first_agents, second_agents
-        ) or self.agreement.separation_reason(first_agents, second_agents)
+        agents = self._agents_in_map(first), self._agents_in_map(second)
+        return self.agreement.unverified_reason(*agents) or self.agreement.separation_reason(*agents)
 
     def rescale_loop(self, loop: Loop, depth_scale: DepthScale | None) -> Loop:
         """Correct a loop for the agents' scales, where known.

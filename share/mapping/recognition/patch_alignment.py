@@ -38,7 +38,7 @@ _SIGMA_PX = 0.2  # of an aligned position
 _INLIER_CHI2 = 9.2  # 99 %, 2 degrees of freedom
 _CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
 _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
-_MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
+_MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where only the map gave the pose
 _ITERATIONS = 6
 _CONVERGED_STEP = 3e-4  # rad and m, at full size
 _MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = 1e-3, 1.0  # relative; no baseline is known better
@@ -183,10 +183,9 @@ def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verifi
     the map has; or why there is none.
 
     Coarse images are used only where the map's pose is too far off without: they take twice the time."""
-    at_once = _align_from_map(T_c_q, query, candidate, _FINE)
-    if isinstance(at_once, Verification):
-        return at_once
-    return _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
+    fine = _align_from_map(T_c_q, query, candidate, _FINE)
+    is_found = isinstance(fine, Verification)
+    return fine if is_found else _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
 
 
 def _align_from_map(
