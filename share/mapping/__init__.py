@@ -4,7 +4,7 @@ Begin with `mapper.Mapper`: `keyframe_lookup.KeyframeLookup.look_up` is a keyfra
 that of a map that has changed:
 
     query_queue          which keyframe is looked up next
-    revisits             which is looked up again, of an agent that waits to enter another's map
+    revisits             which one of a waiting agent is looked up again
     candidates           which others it is compared with, and how
     recognition          align the images of keyframes nearby (`recognition.patch_alignment`); find others
                          (`recognition.index`), verify (`recognition.verification`) and align them
@@ -12,7 +12,7 @@ that of a map that has changed:
     loop_acceptance      is a loop accepted: alone, or with others (`loop_consistency`, `overlap_check`)
     map_graph            nodes, edges, and which segments (`segments`) form one map
     map_solving          the job of the solver (`graph`), and what its solution changes
-    map_gauge            what of that is shown: no motion of the whole map that is uncertain
+    map_gauge            how that is published: without motions of the whole map that are uncertain
     localisation_gate    is an agent's place known well enough to publish a correction?
     corrections          which agents get one
 

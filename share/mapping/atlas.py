@@ -10,9 +10,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from share.config import MergeConfig
-from share.mapping.agents.covariance_scales import inflate_covariance
 from share.mapping.agents.quarantine import Quarantine
 from share.mapping.culling import KeyframeCulling
+from share.mapping.graph.edges import inflate_covariance
 from share.mapping.graph.gravity import make_gravity_factor
 from share.mapping.keyframe_removal import (
     RemovedKeyframe,
@@ -175,20 +175,21 @@ class Atlas:
         self.graph.add_spans(node_id, keyframe)
         return node_id
 
-    def restore(self, kept: StoredMap, ranks: Sequence[int]) -> list[int]:
+    def restore(self, stored_map: StoredMap, ranks: Sequence[int]) -> list[int]:
         """Restore an earlier session's map; the atlas must be empty. Returns the keyframes' node ids.
 
         ranks: of all its segments. All maps need solving afterwards.
         """
         graph, gate, node_ids = self.graph, self._localisation_gate, list[int]()
-        agents = [name.rpartition("/")[0] for name in kept.segments]
+        agents = [name.rpartition("/")[0] for name in stored_map.segments]
         segments = {
             name: graph.odometry.new_segment(agent, rank)
-            for name, agent, rank in zip(kept.segments, agents, ranks, strict=True)
+            for name, agent, rank in zip(stored_map.segments, agents, ranks, strict=True)
         }
-        solved = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
-        for stored in kept.keyframes:
-            key, sent, link = stored.keyframe_key, stored.keyframe, kept.links.get(stored.keyframe_key)
+        poses = stored_map.poses
+        solved = {} if poses is None else dict(zip(poses.keys, poses.T_map_body, strict=True))
+        for stored in stored_map.keyframes:
+            key, sent, link = stored.keyframe_key, stored.keyframe, stored_map.links.get(stored.keyframe_key)
             T_ref_body = sent.T_ref_body if link is None else link.T_ref_body
             cov = inflate_covariance(T_ref_body, sent.cov) if link is None else link.cov
             node_id = graph.odometry.append_node(
@@ -199,7 +200,7 @@ class Atlas:
             graph.add_spans(node_id, sent)
             graph.poses[node_id] = solved.get(key, graph.poses[node_id])
             node_ids.append(node_id)
-        for loop in kept.loops:
+        for loop in stored_map.loops:
             graph.add_loop(loop)
         self.overlap_check.note_restored(max(node_ids, default=-1) + 1)
         self.quarantine.suspect_restored()
@@ -247,7 +248,7 @@ class Atlas:
         self.solving.forget_all_but(graph.odometry.live_segments)
         live = {graph.reference_segments[segment] for segment in graph.odometry.live_segments}
         graph.unsolved_maps = dict.fromkeys(
-            reference_segment for reference_segment in graph.unsolved_maps if reference_segment in live
+            reference for reference in graph.unsolved_maps if reference in live
         )
         self.loop_acceptance.remove_keyframes({out.key for out in removed})
         self.quarantine.agreement.remove_nodes([out.node_id for out in removed], graph.odometry.live_segments)

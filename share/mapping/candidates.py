@@ -1,15 +1,16 @@
-"""Which keyframes a keyframe is compared with, and how: those near it by the map's poses, and those that a
-query finds, by their looks, from the pose that the map has, or not at all.
+"""Which keyframes a keyframe is compared with, and how.
 
-Within a map most of what looks alike is out of view, and what is in view can be aligned from the map's pose,
-which costs a third of a verification and succeeds more often. The map may be wrong, so now and then a
-keyframe's candidates are verified whatever the map says.
+There are two sources: keyframes near it by the map's poses, and keyframes that a query finds by appearance.
+Within a map most of what looks alike is out of view and is left out. What is in view is aligned from the
+map's pose, which costs a third of a verification and succeeds more often. Everything else is verified.
+Because the map may be wrong, the candidates of some keyframes are verified whatever the map says
+(`is_recheck`).
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from typing import NamedTuple
 
@@ -83,7 +84,7 @@ def larger_maps_first(graph: MapGraph, others: Sequence[int]) -> list[int]:
     return sorted(others, key=lambda n: -sizes[graph.reference_segments[nodes[n].segment]])
 
 
-# ---- Which keyframes of its map a keyframe can be aligned with, by the map's poses
+# ---- Keyframes near one by the map's poses
 
 _NEAR_M, _NEAR_RAD = 1.8, 0.7  # between bodies; beyond either, few patches align
 _MAX_CANDIDATES = 3
@@ -116,3 +117,33 @@ def _nearest_first(graph: MapGraph, node_id: int) -> list[int]:
     cost = np.where(angle < _NEAR_RAD, distance / _NEAR_M + angle / _NEAR_RAD, np.inf)
     order = np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]
     return [int(n) for n in node_ids[order]]
+
+
+# ---- How many candidates of a query are checked
+
+MAX_VERIFIED = 3  # verified candidates after which a search ends
+MAX_BACKLOG_CANDIDATES = 3  # candidates tried while other queries wait
+
+
+class CandidateSearch:
+    """Candidates of one keyframe, best first.
+
+    The search ends after `MAX_VERIFIED` verified candidates. While other queries wait it ends after the first
+    verified one, and after `MAX_BACKLOG_CANDIDATES` tried ones.
+    """
+
+    def __init__(self, candidates: Iterable[int]) -> None:
+        self._remaining = deque(candidates)
+        self._tried_count = self._verified_count = 0
+
+    def next_candidate(self, has_backlog: bool) -> int | None:
+        """Return the next candidate to verify; None when there are none left or the budget is spent."""
+        max_tried = MAX_BACKLOG_CANDIDATES if has_backlog else self._tried_count + 1
+        max_verified = 1 if has_backlog else MAX_VERIFIED
+        if not self._remaining or self._tried_count >= max_tried or self._verified_count >= max_verified:
+            return None
+        self._tried_count += 1
+        return self._remaining.popleft()
+
+    def count_verified(self) -> None:
+        self._verified_count += 1

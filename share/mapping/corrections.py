@@ -1,5 +1,6 @@
-"""Events of the mapper's agents, with the corrections that follow. An agent is sent those that matter, and
-gets one notice of one that is held back.
+"""Events of the mapper about its agents, with the corrections that follow.
+
+An agent is sent the corrections that it can notice. A correction that is held back is reported once.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ class CorrectionPublisher:
         return sent + waiting
 
     def _should_send(self, agent: str, correction: Correction) -> bool:
-        """Return whether it answers a keyframe, names another map, or moves odom noticeably."""
+        """Return whether it answers a keyframe, names another map, or moves odom noticeably; if so, it counts
+        as sent."""
         last_sent = self._last_sent.get(agent)
         if last_sent is not None and not _has_changed(last_sent, correction):
             return False

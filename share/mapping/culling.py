@@ -3,10 +3,10 @@
 The keyframes that stay cover the same views, and keep most of the information of those removed
 (`share.mapping.keyframe_removal`).
 
-Quotas are per agent name, not per run: restarts gain nothing. All absent names together count as one name
-beside those present. A name gives in this order: keyframes that resemble others in finished maps, the same in
-ongoing maps, whole finished maps from the smallest, then the most redundant of the rest. A map is finished if
-none of its agents is present and it has keyframes of one name only.
+Quotas are per agent name, not per run, so restarts gain nothing. All absent names together count as one name
+beside those present. Keyframes of a name are removed in this order: those that resemble others in finished
+maps, those that do in ongoing maps, whole finished maps from the smallest, then the most redundant of the
+rest. A map is finished if none of its agents is present and all its keyframes are of one name.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _SAME_PLACE_DISTANCE = 1.0  # in the measure of `redundant`
 
 
 class ReturnReserve(Enum):
-    """Keyframes kept for the return of absent agents, most first.
+    """What is kept for the return of absent agents; the search tries to keep most first.
 
-    NEWEST_AND_MAP: their newest keyframes and something of their map; MAP_ONLY: only the latter.
+    NEWEST_AND_MAP: their newest keyframes and a part of their map. MAP_ONLY: only the latter.
     """
 
     NEWEST_AND_MAP = auto()
@@ -107,20 +107,14 @@ class KeyframeCulling:
 
     def _choose_with(self, count: int, reserve: ReturnReserve) -> InSlices[list[int]]:
         maps = self._segments_by_map()
-        finished = [
-            reference_segment
-            for reference_segment, segments in maps.items()
-            if self._is_finished(segments, reserve)
-        ]
-        ongoing = [reference_segment for reference_segment in maps if reference_segment not in set(finished)]
+        finished = [reference for reference in maps if self._is_finished(maps[reference], reserve)]
+        ongoing = [reference for reference in maps if reference not in set(finished)]
         protected = yield from self._protected(ongoing, reserve)
         quotas, out = self._quotas(count, protected), dict[int, None]()
-        for reference_segment in (*finished, *ongoing):
-            yield from self._add_redundant(
-                maps[reference_segment], protected, quotas, out, _SAME_PLACE_DISTANCE
-            )
-        for reference_segment in (*reversed(finished), *ongoing):
-            yield from self._add_redundant(maps[reference_segment], protected, quotas, out)
+        for reference in (*finished, *ongoing):
+            yield from self._add_redundant(maps[reference], protected, quotas, out, _SAME_PLACE_DISTANCE)
+        for reference in (*reversed(finished), *ongoing):
+            yield from self._add_redundant(maps[reference], protected, quotas, out)
         return list(out)
 
     def _add_redundant(
@@ -144,7 +138,7 @@ class KeyframeCulling:
         removed |= dict.fromkeys(node_ids[i] for i in chosen)
 
     def _quotas(self, count: int, protected: set[int]) -> Counter[str]:
-        """How many keyframes each name gives."""
+        """How many keyframes of each name are to be removed."""
         held_counts = Counter[str]()
         for segment in self._graph.odometry.live_segments:
             held_counts[self._segment_name(segment)] += self._segment_size(segment)
@@ -220,9 +214,9 @@ class KeyframeCulling:
 def fair_quotas(
     counts: Counter[str], limits: Counter[str], count: int, presence_order: Mapping[str, int]
 ) -> Counter[str]:
-    """Split `count` removals among names: one at a time from the name that holds most.
+    """Split `count` removals among names: one at a time from the name with most keyframes.
 
-    Ties go to the name that connected longest ago. A name that holds no more than a fair share gives nothing.
+    Of equals, from the name that connected longest ago. A name with no more than a fair share loses nothing.
     counts: keyframes of each name; limits: how many each can give; presence_order: from
     `AgentRuns.presence_order`.
     """

@@ -12,12 +12,12 @@ from typing import Any
 
 from share.config import Config
 from share.mapping.atlas import Atlas
-from share.mapping.candidates import choose_checks, larger_maps_first, nearby_candidates
+from share.mapping.candidates import CandidateSearch, choose_checks, larger_maps_first, nearby_candidates
 from share.mapping.corrections import MapEvent, MapsJoined
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import SaveView
 from share.mapping.mapper_log import MapperLog
-from share.mapping.query_queue import CandidateSearch, QueryQueue
+from share.mapping.query_queue import QueryQueue
 from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeViews
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.revisits import Revisits
@@ -97,9 +97,11 @@ class KeyframeLookup:
         return is_aligned
 
     def _query(self, node_id: int, is_aligned: bool, is_placed: bool) -> Job:
-        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`. is_placed: the
-        agent does not wait to enter another's map. If it does, only loops with others tell where it is, and
-        only those found without the map's pose: aligned from a pose that is wrong, images confirm it.
+        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`.
+
+        is_placed: the agent does not wait to enter another's map. While it waits, only loops with other
+        agents localise it, and they must be found without the map's pose: images that are aligned from a
+        wrong pose confirm it.
         """
         views, place = self._views.by_node, self._config.place
         if node_id not in views:
@@ -131,9 +133,9 @@ class KeyframeLookup:
                 yield from self._check(make_step(node_id, candidate), search)
 
     def _not_compared(self, node_id: int, is_placed: bool) -> tuple[int, ...]:
-        """Return the keyframes that are not compared with this one: those near it on its segment. Of an agent
-        that is not placed all, and those with which it has a loop, or a pending one, by an earlier look-up:
-        the same pair is no further evidence."""
+        """Return the keyframes that are not compared with this one: those near it on its segment. If its
+        agent is not placed, its whole segment, and keyframes with which it has a loop, accepted or pending,
+        from an earlier look-up: the same pair is no further evidence."""
         graph = self._atlas.graph
         if is_placed:
             return graph.odometry.neighbours(node_id)

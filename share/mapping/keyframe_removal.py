@@ -48,11 +48,8 @@ def remove_keyframe(graph: MapGraph, node_id: int) -> RemovedKeyframe:
     the last loop between two segments. Call `graph.update_maps` afterwards.
     """
     segments, edges = graph.odometry, graph.edges
-    key, previous, following = (
-        segments.nodes[node_id].key,
-        segments.previous_node(node_id),
-        segments.next_node(node_id),
-    )
+    key = segments.nodes[node_id].key
+    previous, following = segments.previous_node(node_id), segments.next_node(node_id)
     incident = edges.incident(node_id)
     loops = [(edges.loops[n], edges.by_id[n]) for n in incident if n in edges.loops]
     odometry_edges = [edges.by_id[n] for n in incident if n not in edges.loops and n not in edges.spans]

@@ -1,10 +1,10 @@
-"""The localisation gate: an agent enters another map once its place there is known well enough.
+"""The localisation gate: an agent enters another map once its pose there is certain enough.
 
 A merge by a few loops at one spot can be wrong by degrees, which further loops correct within seconds; until
-then the agent keeps its own map. Agents that shared a map enter the new one together. What counts is what a
-wearer looks at, so a rotation counts by its lever. As keyframes with loops become more, each of them makes
-the pose less surer, so the gate opens wider; at last it opens to all: in a large hall, far from the
-reference, no pose is known to centimetres.
+then the agent keeps its own map. Agents that shared a map enter the new one together. The gate judges the
+position of what a wearer looks at (`sigma_ahead`), so a rotation counts by its lever. The more keyframes have
+loops, the less each further one improves the pose, so the gate allows a larger sigma. After `PATIENCE` of
+them it opens to all: in a large hall, far from the reference, no pose is known to centimetres.
 """
 
 from __future__ import annotations

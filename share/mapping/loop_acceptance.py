@@ -107,7 +107,7 @@ class LoopAcceptance:
         for (a, b), probation in self._overlap_check.review_joins(node_id):
             if probation.missing > _UNDO_CUSUM or probation.lost > _UNDO_LOST:
                 self._overlap_check.end_probation((a, b))
-                dropped = self._graph.drop_loops(self._separating_loops(a, b))
+                dropped = self.split_segments(a, b)
                 first, second = (self._graph.odometry.segments[s].name for s in (a, b))
                 sums = f"CUSUM {probation.missing:.1f}, {probation.lost:.1f}"
                 reason = f"what {first} and {second} should share is missing ({sums})"
@@ -116,7 +116,7 @@ class LoopAcceptance:
 
     def split_segments(self, a: int, b: int) -> tuple[Loop, ...]:
         """Remove the fewest loops without which segments a and b are in different maps."""
-        return self._graph.drop_loops(self._separating_loops(a, b))
+        return self._graph.drop_loops(self._cut(a, b).edges)
 
     def accept_fitting(self) -> tuple[Loop, ...]:
         """Accept pending loops within a map that fit it now."""
@@ -198,14 +198,10 @@ class LoopAcceptance:
             return LoopDecision(False, f"{reason}, more weight needed")
         if objection := self._overlap_objection(loop):
             return LoopDecision(False, reason + objection)
-        return self._replace_loops(consistent, cut.pairs, reason)
-
-    def _separating_loops(self, a: int, b: int) -> list[int]:
-        """Edge ids of the fewest loops without which segments a and b are in different maps."""
-        return self._cut(a, b).pairs
+        return self._replace_loops(consistent, cut.edges, reason)
 
     def _cut(self, a: int, b: int) -> Cut:
-        """The same, as a cut of edge ids, with the segments on the side of a."""
+        """The loops, by edge id, that `split_segments` removes, and the segments on the side of a."""
         loops = {
             n: tuple(self._graph.segment(key) for key in (loop.a, loop.b))
             for n, loop in self._graph.edges.loops.items()
@@ -213,17 +209,17 @@ class LoopAcceptance:
         }
         edge_ids = list(loops)
         cut = minimum_cut([(x, y) for x, y in loops.values()], a, b)
-        return Cut([edge_ids[i] for i in cut.pairs], cut.start_side)
+        return Cut([edge_ids[i] for i in cut.edges], cut.start_side)
 
     def _weigh_existing(self, cut: Cut) -> LoopEvidence:
         """Weigh the accepted loops of a cut, after computing the found share of a few that lack it."""
         loops = self._graph.edges.loops
-        unchecked = [n for n in cut.pairs if loops[n].found_share is None and is_near(loops[n])]
+        unchecked = [n for n in cut.edges if loops[n].found_share is None and is_near(loops[n])]
         for n in unchecked[:: 1 + len(unchecked) // _MAX_CHECKED]:
             loops[n] = self._overlap_check.with_found_share(loops[n])
-        ends = {self._graph.segment(key) for n in cut.pairs for key in (loops[n].a, loops[n].b)}
+        ends = {self._graph.segment(key) for n in cut.edges for key in (loops[n].a, loops[n].b)}
         sides = {segment: int(segment in cut.start_side) for segment in ends}
-        return weigh_loops([loops[n] for n in cut.pairs], self._graph, sides)
+        return weigh_loops([loops[n] for n in cut.edges], self._graph, sides)
 
     def _replace_loops(self, loops: list[Loop], edge_ids: list[int], reason: str) -> LoopDecision:
         dropped = self._graph.drop_loops(edge_ids)

@@ -43,8 +43,9 @@ class LoopEvidence:
         return self.places * self.found_share**2
 
     def outweighs(self, other: LoopEvidence, ratio: float) -> bool:
-        """Return whether its weight is more than `ratio` times the other's, by all places or by the same few
-        of both: in an aisle and its copy as many places agree as one passes, and what they share tells."""
+        """Return whether its weight is more than `ratio` times the other's, by all places, or by at most
+        `_FEW_PLACES` of either: along an aisle and its copy as many places agree as one passes, and only the
+        found shares differ."""
         few = [replace(x, places=min(x.places, _FEW_PLACES)) for x in (self, other)]
         return self.weight > ratio * other.weight or few[0].weight > ratio * few[1].weight
 
@@ -106,26 +107,26 @@ def _is_one_place(T: F64, poses: F64) -> NDArray[np.bool_]:
 
 
 class Cut(NamedTuple):
-    """pairs: indices of those that are cut; start_side: what is still connected with the start."""
+    """edges: those that are cut; start_side: the nodes that are still connected with the start."""
 
-    pairs: list[int]
+    edges: list[int]
     start_side: set[int]
 
 
-def minimum_cut(pairs: Sequence[tuple[int, int]], start: int, goal: int) -> Cut:
-    """Return the fewest pairs without which no path leads from `start` to `goal`.
+def minimum_cut(edges: Sequence[tuple[int, int]], start: int, goal: int) -> Cut:
+    """Return the fewest edges, by index, without which no path leads from `start` to `goal`.
 
-    pairs: loops, by the two segments that each connects. A minimum cut (Ford and Fulkerson 1956). Raises
-    ValueError if start is goal.
+    edges: loops, by the two segments that each connects. Source: Ford and Fulkerson 1956. Raises ValueError
+    if start is goal.
     """
     if start == goal:
         raise ValueError("start and goal of a cut must be two segments")
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-    names = sorted({start, goal, *(end for pair in pairs for end in pair)})
+    names = sorted({start, goal, *(end for edge in edges for end in edge)})
     index = {name: i for i, name in enumerate(names)}
-    ends: I64 = np.array([(index[a], index[b]) for a, b in pairs], np.int64).reshape(-1, 2)
+    ends: I64 = np.array([(index[a], index[b]) for a, b in edges], np.int64).reshape(-1, 2)
     directed = np.concatenate([ends, ends[:, ::-1]])
     n = len(names)
     capacity = csr_array((np.ones(len(directed), np.int32), (directed[:, 0], directed[:, 1])), shape=(n, n))

@@ -61,12 +61,12 @@ class StoredKeyframe(SaveKeyframe):
     """A keyframe read back. segment_name: `run_key/n`, the n-th of its run.
 
     A keyframe without a reference begins a segment. ordinal: number of keyframes before it there, including
-    removed ones unless they were the newest. came_s: when it was stored, unix s; None if unknown.
+    removed ones unless they were the newest. arrived_s: when it was stored, unix s; None if unknown.
     """
 
     segment_name: str
     ordinal: int
-    came_s: int | None = None
+    arrived_s: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +215,9 @@ class StoredMap:
     objects: tuple[SaveObject, ...] = ()
 
 
-def with_unknown_credentials(kept: StoredMap) -> StoredMap:
+def with_unknown_credentials(stored: StoredMap) -> StoredMap:
     """Mark runs without a credential as unknown, for an edge that uses keys."""
-    return replace(kept, runs=tuple(replace(run, credential=run.credential or None) for run in kept.runs))
+    return replace(stored, runs=tuple(replace(run, credential=run.credential or None) for run in stored.runs))
 
 
 def odometry_link(keyframe: SaveKeyframe, links: Mapping[KeyframeKey, SaveLink]) -> SaveLink:
@@ -228,19 +228,19 @@ def odometry_link(keyframe: SaveKeyframe, links: Mapping[KeyframeKey, SaveLink])
     )
 
 
-def map_poses(kept: StoredMap) -> dict[KeyframeKey, tuple[str, F64]]:
+def map_poses(stored: StoredMap) -> dict[KeyframeKey, tuple[str, F64]]:
     """Map name and T_map_body (4, 4) of every keyframe.
 
     A keyframe newer than the solution follows its reference. A segment without a solution is a map of its
     own, posed by odometry.
     """
-    solved = {} if kept.poses is None else _poses_by_key(kept.poses)
+    solved = {} if stored.poses is None else _poses_by_key(stored.poses)
     out: dict[KeyframeKey, tuple[str, F64]] = {}
-    for keyframe in kept.keyframes:
+    for keyframe in stored.keyframes:
         if keyframe.keyframe_key in solved:
             out[keyframe.keyframe_key] = solved[keyframe.keyframe_key]
             continue
-        edge = odometry_link(keyframe, kept.links)
+        edge = odometry_link(keyframe, stored.links)
         reference = KeyframeKey(keyframe.run_key, edge.reference)
         previous = out.get(reference) or solved.get(reference)
         if previous is None:

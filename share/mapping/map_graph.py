@@ -15,17 +15,17 @@ from dataclasses import replace
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.agents.covariance_scales import inflate_span
 from share.mapping.graph.covariance import CovariancePaths
-from share.mapping.graph.edges import PoseEdge
+from share.mapping.graph.edges import PoseEdge, inflate_span
 from share.mapping.graph.solver import GraphUpdate
 from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.pose_table import PoseTable
 from share.mapping.segments import OdometrySegments
 from share.types import F64, Keyframe
 
-_SHARED_INFORMATION = 2.0  # factor on the covariance of odometry over several keyframes: it shares its
-# measurements with that between neighbours
+# Factor on the covariance of odometry over several keyframes: it shares its measurements with the steps
+# between.
+_SHARED_INFORMATION = 2.0
 
 
 class GraphEdges:
@@ -268,10 +268,8 @@ class MapGraph:
 
     def rescale_odometry(self, agent: str, log_scale: float, covariance_scale: float) -> None:
         """Set an agent's log scale and covariance scale; its maps need to be solved again."""
-        log_change, covariance_ratio = (
-            log_scale - self.log_scales.get(agent, 0.0),
-            covariance_scale / self.covariance_scales.get(agent, 1.0),
-        )
+        log_change = log_scale - self.log_scales.get(agent, 0.0)
+        covariance_ratio = covariance_scale / self.covariance_scales.get(agent, 1.0)
         self.log_scales[agent], self.covariance_scales[agent] = log_scale, covariance_scale
         for segment_index, segment in enumerate(self.odometry.segments):
             if segment.agent != agent or not segment.nodes:
@@ -359,10 +357,6 @@ class MapGraph:
         """T_map_odom (4, 4) at this node."""
         T_odom_body = self.odometry.nodes[node_id].T_odom_body
         return se3.orthonormal(self.poses[node_id] @ se3.inverse(T_odom_body))
-
-    def place(self, node_id: int) -> tuple[F64, str]:
-        """T_map_odom (4, 4) at this node, and the name of its map."""
-        return self.T_map_odom(node_id), self.map_id(self.odometry.nodes[node_id].segment)
 
     def relative_pose(self, a: int, b: int) -> F64:
         """T_a_b (4, 4) of two nodes of one map."""

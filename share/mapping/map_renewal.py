@@ -1,8 +1,9 @@
-"""Renewal of a map of an earlier session: what is gone leaves it, once views of today stand in its place.
+"""Renewal of a map from an earlier session: keyframes that show what is gone are removed, once views of today
+can replace them.
 
-A keyframe of an earlier session goes when views of today from its place show the rest of what it shows, and
-again and again not the same things. Other light alone hides things here and there, not all of a region amid
-others that are found; and where nothing of today stands in its place, a keyframe stays, so no map is emptied.
+A keyframe of an earlier session is removed when views of today from its place show most of what it shows, but
+several of them miss whole regions of it. Different light alone hides single points, not a region amid others
+that are found. Where no view of today is from its place a keyframe stays, so no map is emptied.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _MAX_COMPARED = 3  # keyframes of earlier sessions, with each of today
 
 @dataclass
 class _Loss:
-    """What a keyframe shows that views of today miss: CUSUM of the share, and how many views miss any."""
+    """What views of today miss of a keyframe: CUSUM of the missing share, and how many views miss any."""
 
     missing: float = 0.0
     view_count: int = 0
@@ -67,7 +68,7 @@ class MapRenewal:
         return [node_id for node_id in outdated if node_id in self._graph.poses]
 
     def _earlier_keyframes_near(self, node_id: int) -> list[int]:
-        """Return the keyframes of earlier sessions that this one can stand for, the nearest."""
+        """Return the nearest keyframes of earlier sessions that this one can replace."""
         graph, is_earlier = self._graph, self._overlap_check.is_earlier
         if is_earlier(node_id) or self._overlap_check.is_on_probation(graph.odometry.nodes[node_id].segment):
             return []

@@ -13,7 +13,7 @@ from share.mapping.graph.solver import GraphSolution, GraphUpdate
 from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
 from share.mapping.loop_acceptance import LoopAcceptance, pending_text
 from share.mapping.loops import KeyframeKey, Loop
-from share.mapping.map_gauge import MapGauge, SolvedPlace
+from share.mapping.map_gauge import MapGauge, SolvedPose
 from share.mapping.map_graph import MapGraph
 from share.mapping.segments import AgentRuns
 from share.types import F64, Correction
@@ -88,7 +88,7 @@ class MapSolving:
         self._answered_ids.pop(agent, None)
 
     def forget_all_but(self, segments: Collection[int]) -> None:
-        """Forget what was shown to all but these segments: the others have no keyframes."""
+        """Forget what was published to all but these segments: the others have no keyframes."""
         self._gauge.forget_all_but(segments)
 
     def schedule_unpublished(self, agent: str) -> None:
@@ -105,10 +105,7 @@ class MapSolving:
 
     def due_maps(self) -> list[str]:
         """Names of maps that changed since their last job, longest waiting first."""
-        return [
-            self._graph.odometry.segments[reference_segment].name
-            for reference_segment in self._graph.unsolved_maps
-        ]
+        return [self._graph.odometry.segments[reference].name for reference in self._graph.unsolved_maps]
 
     def make_job(self, map_id: str) -> SolveJob:
         """Return the solver job of a map. Raises ValueError if there is no such map."""
@@ -224,21 +221,21 @@ class MapSolving:
             is_current = odometry.current_segment(odometry.segments[segment].agent) == segment
             if cov is not None and is_current and last in odometry.nodes:
                 passed[segment] = last, cov
-        shown = self._gauge.show(job.segments[0], self._solved_places(passed))
+        published = self._gauge.publish(job.segments[0], self._solved_poses(passed))
         out: dict[str, Correction] = {}
         failed: dict[str, str] = {}
         for segment, (last, cov) in passed.items():
             agent, map_id = odometry.segments[segment].agent, graph.map_id(segment)
             about_id, answered_id = odometry.nodes[last].key.id, answered_ids.get(agent, -1)
             try:
-                out[agent] = Correction(shown[segment], cov, map_id, 0, about_id, answered_id)
+                out[agent] = Correction(published[segment], cov, map_id, 0, about_id, answered_id)
             except ValueError as error:
                 failed[agent] = f"no correction: {error}"
         return out, failed
 
-    def _solved_places(self, passed: Mapping[int, tuple[int, F64]]) -> dict[int, SolvedPlace]:
-        """Where segments are by their newest solved nodes. passed: by segment, node and covariance (6, 6) of
-        T_map_odom. At once, since one by one they would take most of applying a solution."""
+    def _solved_poses(self, passed: Mapping[int, tuple[int, F64]]) -> dict[int, SolvedPose]:
+        """Poses of segments at their newest solved nodes. passed: by segment, node and covariance (6, 6) of
+        T_map_odom. Computed at once: one by one they would take most of the time of applying a solution."""
         if not passed:
             return {}
         graph, odometry = self._graph, self._graph.odometry
@@ -252,5 +249,5 @@ class MapSolving:
             previous = odometry.previous_node(node_id)
             step_cov = cov if previous is None else graph.odometry_edge(previous, node_id).cov
             variance = max(_MIN_STEP_VARIANCE, se3.position_sigma(step_cov) ** 2)
-            out[segment] = SolvedPlace(T_map_odom[i], T_odom_body[i], sigma_ahead(body_covs[i]), variance)
+            out[segment] = SolvedPose(T_map_odom[i], T_odom_body[i], sigma_ahead(body_covs[i]), variance)
         return out

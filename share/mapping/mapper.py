@@ -21,8 +21,9 @@ from share.mapping.keyframe_removal import RemovedKeyframe
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, SavePoses, StoredMap
 from share.mapping.mapper_log import MapperLog
-from share.mapping.query_queue import QueryQueue, map_rank, restored_ranks, service_kind
+from share.mapping.query_queue import QueryQueue, service_kind
 from share.mapping.recognition.keyframe_views import ArchiveReader, KeyframeViews
+from share.mapping.segments import restored_ranks, segment_rank
 from share.mapping.steps import Job, LookupStep, SolveStep, Step, StepRunner
 from share.types import Keyframe
 from share.wire.messages import Hello
@@ -82,14 +83,14 @@ class Mapper:
         keyframe, link = self.atlas.reconnect(agent, keyframe)
         self._log.changes += [] if link is None else [link]
         hello = self._hellos[agent]
-        node_id = self.atlas.add_keyframe(agent, keyframe, map_rank(self._config, hello))
+        node_id = self.atlas.add_keyframe(agent, keyframe, segment_rank(self._config, hello))
         self.views.add(node_id, self.atlas.key(node_id), keyframe, hello.rig)
         self._retention.add(node_id)
         self.queries.add(agent, service_kind(self._config, hello), node_id, is_extra)
         events = []
         if keyframe.reference < 0 or (link is not None and link.reference < 0):
-            T_map_odom, map_id = self.atlas.graph.place(node_id)
-            events = [map_assignment(agent, map_id, T_map_odom, keyframe.id)]
+            map_id = self.atlas.map_id(self.atlas.key(node_id))
+            events = [map_assignment(agent, map_id, self.atlas.graph.T_map_odom(node_id), keyframe.id)]
         if redundant := self.atlas.culling.next_nodes(self._config.edge.max_keyframes):
             self.remove_keyframes(redundant)
         if outdated := self.atlas.renewal.take_outdated():
@@ -127,22 +128,22 @@ class Mapper:
     def _note_empty(self, agent: str) -> None:
         self._empty_runs.append(KeyframeKey(agent, self._counters.runs[agent].newest_id))
 
-    def restore(self, kept: StoredMap) -> None:
+    def restore(self, stored_map: StoredMap) -> None:
         """Restore the map of an earlier session, before anything else is added.
 
         Restored maps keep their reference segments, also before headsets that come now. Their views are
         indexed beside look-ups.
         """
-        for run in kept.runs:
+        for run in stored_map.runs:
             self.add_run(run.run_key, run.hello, run.credential)
             self.set_present(run.run_key, False)
-        ranks = restored_ranks(self._config, kept)
-        restored = list(zip(self.atlas.restore(kept, ranks), kept.keyframes, strict=True))
+        ranks = restored_ranks(self._config, stored_map)
+        restored = list(zip(self.atlas.restore(stored_map, ranks), stored_map.keyframes, strict=True))
         self.views.restore(
             [(n, one.keyframe_key, one.keyframe, self._hellos[one.run_key].rig) for n, one in restored]
         )
         for node_id, stored in restored:
-            self._retention.add(node_id, stored.came_s)
+            self._retention.add(node_id, stored.arrived_s)
             self._counters.runs[stored.run_key].newest_id = stored.keyframe.id
 
     # Steps: what to do next, and what follows from the result

@@ -38,8 +38,8 @@ _MAX_CACHED = 4000  # pairs
 
 
 class UsualShares(NamedTuple):
-    """Of the points in both views of a right pair: missing, the share in missing regions, is seldom more;
-    found, the share that is found, seldom less."""
+    """Bounds for two views of one place, as shares of the points that both should show: missing regions
+    seldom have a larger one, found points seldom a smaller one."""
 
     missing: float
     found: float
@@ -52,7 +52,7 @@ OTHER_DAY = UsualShares(missing=0.10, found=0.50)
 
 
 class Comparison(NamedTuple):
-    """A pair of views, and what is usual for a right one."""
+    """A pair of views, and what is usual for views of one place."""
 
     regions: MissingRegions
     usual: UsualShares

@@ -3,80 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable
 
 from share.config import Config, EdgeConfig
-from share.mapping.map_changes import StoredMap
 from share.scheduling.policies import POLICIES
 from share.scheduling.qoe import QoeParameters
 from share.types import AgentKind
 from share.wire.messages import Hello
 
 MIN_BACKLOG = 1  # with this many queued, a query verifies fewer candidates
-MAX_BACKLOG_CANDIDATES = 3  # at most these, and the first verified one ends the search
 MAX_WAITING_EACH = 3  # queued queries of one agent
-MAX_VERIFIED = 3  # verified candidates after which a search ends
-
-
-class CandidateSearch:
-    """Candidates of one keyframe, best first.
-
-    The search ends after `MAX_VERIFIED` verified candidates; while other queries wait after one, and after
-    at most `MAX_BACKLOG_CANDIDATES` tried ones.
-    """
-
-    def __init__(self, candidates: Iterable[int]) -> None:
-        self._remaining = deque(candidates)
-        self._tried_count = self._verified_count = 0
-
-    def next_candidate(self, has_backlog: bool) -> int | None:
-        """Return the next candidate to verify; None when there are none left or the budget is spent."""
-        max_tried = MAX_BACKLOG_CANDIDATES if has_backlog else self._tried_count + 1
-        max_verified = 1 if has_backlog else MAX_VERIFIED
-        if not self._remaining or self._tried_count >= max_tried or self._verified_count >= max_verified:
-            return None
-        self._tried_count += 1
-        return self._remaining.popleft()
-
-    def count_verified(self) -> None:
-        self._verified_count += 1
-
-
 _NEWEST_CONSIDERED = 4  # agents with the newest keyframes; older ones would be answered too late
 _TURN_WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as many turns as a headset
 _MAX_SKIPPED = 100  # newest skipped keyframes, which may be looked up when nothing waits
-
-
-def qoe_form(config: Config, hello: Hello) -> AgentKind:
-    """Kind of QoE that the agent needs: set by the configuration, by default its own kind."""
-    return QoeParameters.from_config(config.control, hello.kind, hello.name).form
 
 
 def service_kind(config: Config, hello: Hello) -> AgentKind:
     """Kind that sets the agent's share of look-ups; AR for all under policies that treat agents alike."""
     if POLICIES[config.edge.policy].treats_alike:
         return AgentKind.AR
-    return qoe_form(config, hello)
-
-
-def map_rank(config: Config, hello: Hello | None, is_reference: bool = False) -> int:
-    """Rank of a new segment: lower ranks keep their map in a merge; even ranks are headsets'.
-
-    Headsets' maps stay, as their wearers would notice a jump; restored maps come first. hello: None if
-    missing in a damaged file.
-    """
-    is_headset = hello is not None and qoe_form(config, hello) is AgentKind.AR
-    return (0 if is_headset else 1) + (0 if is_reference else 2)
-
-
-def restored_ranks(config: Config, kept: StoredMap) -> list[int]:
-    """Rank of each segment of a restored map. Restored maps keep their reference segments."""
-    references = set[str]() if kept.poses is None else set(kept.poses.map_ids)
-    hellos = {run.run_key: run.hello for run in kept.runs}  # a damaged file may lack a segment's run
-    return [
-        map_rank(config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
-        for name in kept.segments
-    ]
+    return QoeParameters.from_config(config.control, hello.kind, hello.name).form
 
 
 class QueryQueue:

@@ -1,8 +1,8 @@
 """Revisits: keyframes of an agent that waits to enter another's map are looked up again.
 
-What an agent saw before its map became part of another's was compared with what was near it in its own map.
-Now others' keyframes are near it that were not compared. So the agent is known there sooner, and by loops
-that are apart from each other, whose errors are less alike than those of the keyframes that come next.
+Before the agent's map became part of another's, its keyframes were compared with those near them in its own
+map. In the joined map other keyframes are near them. Loops with these localise the agent there sooner, and
+they are far apart, so their errors are less correlated than those of the next keyframes' loops.
 """
 
 from __future__ import annotations

@@ -1,12 +1,16 @@
-"""Odometry segments as the agents sent them, and the runs of each agent."""
+"""Odometry segments as the agents sent them, their ranks, and the runs of each agent."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field
 
+from share.config import Config
 from share.mapping.loops import KeyframeKey
-from share.types import F64, Keyframe
+from share.mapping.map_changes import StoredMap
+from share.scheduling.qoe import QoeParameters
+from share.types import F64, AgentKind, Keyframe
+from share.wire.messages import Hello
 
 MIN_LOOP_GAP = 10  # keyframes of one segment closer than this make no loop
 
@@ -158,6 +162,26 @@ class OdometrySegments:
         nodes = self.segments[self.nodes[node_id].segment].nodes
         i = bisect_left(nodes, node_id) + step
         return nodes[i] if 0 <= i < len(nodes) else None
+
+
+def segment_rank(config: Config, hello: Hello | None, is_reference: bool = False) -> int:
+    """Rank of a new segment: in a merge the map of the lower rank stays. Even ranks are headsets'.
+
+    Headsets' maps stay because their wearers would notice a jump; restored maps come before new ones. hello:
+    None if missing in a damaged file.
+    """
+    form = None if hello is None else QoeParameters.from_config(config.control, hello.kind, hello.name).form
+    return (0 if form is AgentKind.AR else 1) + (0 if is_reference else 2)
+
+
+def restored_ranks(config: Config, stored: StoredMap) -> list[int]:
+    """Rank of each segment of a restored map. Restored maps keep their reference segments."""
+    references = set[str]() if stored.poses is None else set(stored.poses.map_ids)
+    hellos = {run.run_key: run.hello for run in stored.runs}  # a damaged file may lack a segment's run
+    return [
+        segment_rank(config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
+        for name in stored.segments
+    ]
 
 
 # Runs of each agent: which are connected, and which is the current one of a name.

@@ -15,11 +15,11 @@ from share.odometry.feature_appearance import Appearance
 from share.odometry.state import CORE_SIZE, KEYFRAMES_START, FilterState
 from share.types import F64, I64
 
-_MAX_RELATIVE_SIGMA = 0.1  # relative sigma of an inverse depth that is kept
+_MAX_RELATIVE_SIGMA = 0.1  # of the inverse depth of a feature that is kept
 _SIGMA_INFLATION = 1.5  # times its sigma, because its correlation with the poses is lost
 _MAX_PER_KEYFRAME = 40  # features
-_MAX_SEARCHED = 80  # that a keyframe searches for again,
-_MAX_DISTANCE_M, _MAX_ANGLE_RAD = 1.5, 0.7  # of keyframes at most so far away
+_MAX_SEARCHED = 80  # features that a keyframe searches for again
+_MAX_DISTANCE_M, _MAX_ANGLE_RAD = 1.5, 0.7  # from it to their anchor keyframes
 _FREE = -1  # keyframe of a row without a feature
 
 

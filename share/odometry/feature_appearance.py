@@ -16,8 +16,8 @@ from share.vision.patches import Patches
 
 _YOUNG_FRAMES = 10  # a feature of fewer frames is matched in cam1 in every frame
 _DRIFT_GAIN = 0.2  # of the exponential mean of a feature's residual
-_MIN_DRIFT_PX = 0.5  # a drift above this,
-_MIN_DRIFT_RATIO = 5.0  # and above this many times the first quartile of all, is a feature's own motion
+# A feature moves by itself if its drift is above this, and above this many times the first quartile of all.
+_MIN_DRIFT_PX, _MIN_DRIFT_RATIO = 0.5, 5.0
 _MIN_FEATURES = 12  # fewer cannot be compared with each other
 _SLANT_SIGMA = 0.4  # tangent of a surface's slant, one sigma of the room's surfaces
 _MIN_RHO = 0.05  # 1/m; the slant of what is further away does not show
@@ -70,8 +70,9 @@ def drifting_features(appearance: Appearance, indices: I64, residual: F64) -> ND
     """Return which of features `indices` (M,) move by themselves, and update their drift. residual (M, 2):
     px, measured minus predicted.
 
-    A slow mover passes every gate, a little off each time in the same direction, and drags the pose along.
-    The quarter with the least drift counts as static; its median residual is the pose's error.
+    A slowly moving feature passes every gate, since it is only a little off each time, but always in the same
+    direction, so that it biases the pose. The quarter with the least drift counts as static; its median
+    residual is the pose's error.
     """
     if len(indices) < _MIN_FEATURES:
         return np.zeros(len(indices), bool)

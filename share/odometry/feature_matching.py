@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,25 +26,25 @@ _MAX_MISSING_SHARE = 0.15  # of the features in view; if more are missing, they 
 
 @dataclass(frozen=True, eq=False)
 class StereoMatches:
-    """Indices (M,) of the features found in cam1, and their normalised coordinates `at` (M, 2)."""
+    """Indices (M,) of the features found in cam1, and their normalised coordinates uv (M, 2)."""
 
     feature: I64
-    at: F64
+    uv: F64
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureMatches:
     """Matches of all N features in cam0.
 
-    px (N, 2) and at (N, 2): measured position, in pixels and normalised; `at` is NaN where is_found (N,) is
-    False. is_dynamic (N,): set later, by `LandmarkMap`. predicted_px, predicted_uv (N, 2): predicted
-    position, NaN behind the camera. warp (N, 2, 2): d px / d px of the first image. px_per_rho (N, 2):
-    derivative of the position in the first image by inverse depth. samples (N, S): see
-    `patches.AlignedPatches`. cam1: matches in cam1.
+    px, uv (N, 2): measured position, in pixels and normalised; uv is NaN where is_found (N,) is False.
+    is_dynamic (N,): set later, by `visual_update.mark_dynamic` and `LandmarkMap.record_frame`. predicted_px,
+    predicted_uv (N, 2): predicted position, NaN behind the camera. warp (N, 2, 2): d px / d px of the first
+    image. px_per_rho (N, 2): derivative of the position in the first image by inverse depth. samples (N, S):
+    see `patches.AlignedPatches`. cam1: matches in cam1.
     """
 
     px: F32
-    at: F64
+    uv: F64
     is_found: NDArray[np.bool_]
     is_dynamic: NDArray[np.bool_]
     predicted_px: F64
@@ -64,43 +65,42 @@ def match_features(
     """Match the features in the images of a frame, both in one pass; in cam1 only those that are due. The
     covariance is not used."""
     n = len(state.feature_ids)
-    indices = np.arange(n)
     images: tuple[U8, ...] = (frame.image0,)
-    cameras, cam0_count = [rig.cam0], len(indices)
+    indices, cameras = np.arange(n), [rig.cam0]
     if frame.image1 is not None and rig.cam1 is not None and not cam0_only:
         images, cameras = (frame.image0, frame.image1), [rig.cam0, rig.cam1]
         indices = np.concatenate([indices, np.flatnonzero(is_stereo_due(appearance))])
-    is_in_cam1 = np.arange(len(indices)) >= cam0_count
+    is_in_cam1 = np.arange(len(indices)) >= n
     T = rig.T_cam1_cam0 if len(cameras) > 1 else None
     patch = predict_patches(
         state, indices, appearance.ray_per_px[indices], appearance.slant[indices], T, is_in_cam1
     )
-    parts = [slice(0, cam0_count), slice(cam0_count, None)][: len(cameras)]
-    expected = np.concatenate([c.distort(patch.uv[part]) for c, part in zip(cameras, parts, strict=True)])
-    jacobian = np.concatenate([c.jacobian(patch.uv[part]) for c, part in zip(cameras, parts, strict=True)])
-    warp = jacobian @ patch.warp
-    inside = np.concatenate(
-        [c.is_inside(expected[part], _BORDER_PX) for c, part in zip(cameras, parts, strict=True)]
-    )
-    to_align = np.flatnonzero(inside)
-    cam0_patch = PatchPrediction(patch.uv[:cam0_count], patch.warp[:cam0_count], patch.J_rho[:cam0_count])
-    out = _no_matches(expected[:cam0_count], cam0_patch, warp[:cam0_count])
+
+    def of_each(evaluate: Callable[[Camera, slice], F64]) -> F64:
+        parts = (slice(n), slice(n, None))
+        return np.concatenate([evaluate(*one) for one in zip(cameras, parts, strict=False)])
+
+    expected = of_each(lambda camera, part: camera.distort(patch.uv[part]))
+    jacobian = of_each(lambda camera, part: camera.jacobian(patch.uv[part]))
+    inside = of_each(lambda camera, part: camera.is_inside(expected[part], _BORDER_PX))
+    to_align, warp = np.flatnonzero(inside), jacobian @ patch.warp
+    out = _no_matches(expected[:n], patch.take(np.arange(n)), warp[:n])
     if len(to_align) == 0:
         return out
-    cam0_to_align = int(np.searchsorted(to_align, cam0_count))
+    cam0_to_align = int(np.searchsorted(to_align, n))
     px = expected[to_align]
     aligned = patches.align(
         images, cam0_to_align, appearance.patch.kernels[indices[to_align]], px, warp[to_align]
     )
     accepted = _is_match(aligned, px, _MAX_REACH_PX)
-    uv = patch.uv[to_align] + _solved(jacobian[to_align], aligned.px - px)
+    uv = patch.uv[to_align] + _solve_2x2(jacobian[to_align], aligned.px - px)
     in_cam0, in_cam1 = slice(0, cam0_to_align), slice(cam0_to_align, None)
     for camera, part in zip(cameras, (in_cam0, in_cam1), strict=False):
-        at = to_align[part]
-        uv[part] = _undistorted(camera, aligned.px[part], uv[part], patch.uv[at], jacobian[at])
+        rows = to_align[part]
+        uv[part] = _undistorted(camera, aligned.px[part], uv[part], patch.uv[rows], jacobian[rows])
         if camera.is_bounded:  # the aligned position may have no normalised coordinates
             accepted[part] &= camera.has_normalised(aligned.px[part].astype(np.float64))
-    _store(out, indices[to_align[in_cam0]], aligned, uv[in_cam0], accepted[in_cam0], in_cam0)
+    _store_matches(out, indices[to_align[in_cam0]], aligned, uv[in_cam0], accepted[in_cam0], in_cam0)
     if len(cameras) == 1:
         return out
     number = indices[to_align[in_cam1]]
@@ -114,7 +114,7 @@ def _undistorted(camera: Camera, px: F32, uv: F64, predicted_uv: F64, jacobian: 
     if camera.is_fisheye:  # the Jacobian changes within a few px
         return camera.normalise(px.astype(np.float64), predicted_uv)
     if camera.distortion:
-        return np.asarray(uv + _solved(jacobian, px - camera.distort(uv)))
+        return np.asarray(uv + _solve_2x2(jacobian, px - camera.distort(uv)))
     return uv
 
 
@@ -143,9 +143,9 @@ def match_by_flow(
     aligned = patches.align(
         (image,), len(missing), appearance.patch.kernels[missing], flow_px, matches.warp[missing]
     )
-    start_px = camera.normalise(aligned.px.astype(np.float64))
-    accepted = _is_match(aligned, flow_px, _MAX_FLOW_ERROR_PX) & np.isfinite(start_px).all(axis=1)
-    _store(matches, missing, aligned, start_px, accepted, slice(None))
+    uv = camera.normalise(aligned.px.astype(np.float64))
+    accepted = _is_match(aligned, flow_px, _MAX_FLOW_ERROR_PX) & np.isfinite(uv).all(axis=1)
+    _store_matches(matches, missing, aligned, uv, accepted, slice(None))
 
 
 def _no_matches(predicted_px: F64, patch: PatchPrediction, warp: F64) -> FeatureMatches:
@@ -153,13 +153,13 @@ def _no_matches(predicted_px: F64, patch: PatchPrediction, warp: F64) -> Feature
     n = len(predicted_px)
     none, samples = np.zeros(n, bool), np.zeros((n, len(patches.OFFSETS)), np.float32)
     px = np.where(np.isnan(predicted_px), -1e6, predicted_px).astype(np.float32)
-    at = np.full((n, 2), np.nan)
+    uv = np.full((n, 2), np.nan)
     return FeatureMatches(
-        px, at, none, none.copy(), predicted_px, patch.uv, warp, _px_per_rho(patch), samples
+        px, uv, none, none.copy(), predicted_px, patch.uv, warp, _px_per_rho(patch), samples
     )
 
 
-def _solved(J: F64, b: F64) -> F64:
+def _solve_2x2(J: F64, b: F64) -> F64:
     """Return x (N, 2) with J x = b for J (N, 2, 2), b (N, 2); not finite where J is singular."""
     p, q, r, s = J[:, 0, 0], J[:, 0, 1], J[:, 1, 0], J[:, 1, 1]
     x, y = b[:, 0], b[:, 1]
@@ -174,7 +174,7 @@ def _solved(J: F64, b: F64) -> F64:
 def _px_per_rho(patch: PatchPrediction) -> F64:
     """Return the derivative (N, 2) px of the position in the first image by inverse depth; 0 where it is not
     finite."""
-    out = _solved(patch.warp, patch.J_rho)
+    out = _solve_2x2(patch.warp, patch.J_rho)
     return np.where(np.isfinite(out), out, 0.0)
 
 
@@ -186,18 +186,18 @@ def _is_match(aligned: patches.AlignedPatches, px: F64, reach_px: float) -> NDAr
     return out
 
 
-def _store(
+def _store_matches(
     out: FeatureMatches,
     indices: I64,
     aligned: patches.AlignedPatches,
-    at: F64,
+    uv: F64,
     accepted: NDArray[np.bool_],
     part: slice,
 ) -> None:
     out.px[indices] = aligned.px[part]
     out.is_found[indices] = accepted
     out.samples[indices] = aligned.samples[part]
-    out.at[indices[accepted]] = at[accepted]
+    out.uv[indices[accepted]] = uv[accepted]
 
 
 # Predicted positions of features, and their derivatives by the state.

@@ -394,7 +394,7 @@ def scale_sigma(state: FilterState) -> float:
 
 
 def keyframe_cov(state: FilterState, k: int) -> F64:
-    """Return the covariance (6, 6) of the pose of keyframe k, z up, perturbed on the right."""
+    """Return the covariance (6, 6) of the pose of keyframe k in odom, perturbed on the right."""
     columns, Ad = state.keyframe_columns(k), se3.adjoint(se3.inverse(state.keyframe_poses[k]))
     out: F64 = Ad @ state.cov[columns, columns] @ Ad.T
     return out

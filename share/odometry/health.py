@@ -9,8 +9,8 @@ from share.odometry.state import FilterState
 from share.odometry.track_result import median
 from share.types import F64, TrackState
 
-WEAK = 25  # features in use; fewer: WEAK
-BLIND = 6  # features in use; fewer: INERTIAL_ONLY
+MIN_OK_FEATURES = 25  # in use; with fewer the state is WEAK
+MIN_POSE_FEATURES = 6  # in use; with fewer it is INERTIAL_ONLY
 _MAX_DRIFT_M = 0.5  # position sigma since the newest keyframe at which the state is LOST
 _SETTLING_S = 1.0  # after its start, in which a filter converges
 _MIN_DURATION_S = 1.0  # of frames after that, before an inconsistency is reported
@@ -52,11 +52,11 @@ class ImageImuConsistency:
 
 
 class DivergenceMonitor:
-    """Detects a wrong filter: textured images that show almost none of the features that should be in view,
-    or for long none that the filter accepts.
+    """Detects a diverged filter: textured images show almost none of the features that should be in view, or
+    for long none that the filter accepts.
 
-    Features that have left the view do not count. With fewer than `WEAK` features in view a frame says
-    little; fewer than `BLIND` found or accepted count as none.
+    Features that have left the view do not count. A frame with fewer than `MIN_OK_FEATURES` in view says
+    little; fewer than `MIN_POSE_FEATURES` found or accepted count as none.
     """
 
     def __init__(self) -> None:
@@ -70,10 +70,10 @@ class DivergenceMonitor:
         textured: the image shows something. `in_view` features should be in view, `found_count` were found,
         `inlier_count` were accepted as well.
         """
-        if textured and in_view >= WEAK:
-            self._empty_frames = self._empty_frames + 1 if found_count < BLIND else 0
-        if in_view >= BLIND:  # else all were rejected in the frame before, and are gone
-            rejected = textured and inlier_count < BLIND
+        if textured and in_view >= MIN_OK_FEATURES:
+            self._empty_frames = self._empty_frames + 1 if found_count < MIN_POSE_FEATURES else 0
+        if in_view >= MIN_POSE_FEATURES:  # else all were rejected in the frame before, and are gone
+            rejected = textured and inlier_count < MIN_POSE_FEATURES
             self._rejected_s = self._rejected_s + min(interval_s, _MAX_INTERVAL_S) if rejected else 0.0
 
     @property
@@ -95,8 +95,8 @@ def is_plausible(s: FilterState, max_speed_m_s: float) -> bool:
 
 def pose_state(count: int, has_imu: bool) -> TrackState:
     """Return the state of a frame whose pose is based on `count` features and, with `has_imu`, on the IMU."""
-    if count < BLIND:
+    if count < MIN_POSE_FEATURES:
         return TrackState.INERTIAL_ONLY if has_imu else TrackState.LOST
     if not has_imu:
         return TrackState.VISION_ONLY
-    return TrackState.OK if count >= WEAK else TrackState.WEAK
+    return TrackState.OK if count >= MIN_OK_FEATURES else TrackState.WEAK

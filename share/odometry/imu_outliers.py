@@ -1,5 +1,4 @@
-"""Reject IMU samples that no motion of a body explains: runs of wrong samples, up to a fifth of a second
-long.
+"""Reject IMU samples that no motion of a body explains, in runs of up to a fifth of a second.
 
 `share.sensors.imu_check` removes certain glitches: up to three samples with neighbours on both sides. This
 detector does not wait for later samples, so a rejected sample may be true: a knock looks the same at first.
@@ -44,8 +43,8 @@ _MAX_HISTORY = 4096  # rejected samples; an IMU gives fewer in that time
 _NO_AXES = np.zeros(6, np.bool_)
 _MIN_CHAIN = 3  # a shorter chain is also compared with the last sample before the gap
 _MAX_NOISE_STEP = _STEP_MARGIN / _STEP_RATIO  # the largest recent step assumed where none is known
-_CERTAIN_CHAIN = 12  # accepted samples that end a restart,
-_CERTAIN_SHARE = 2 / 3  # if they are this share of its samples
+# A restart ends once so many samples are accepted, and they are this share of all its samples.
+_CERTAIN_CHAIN, _CERTAIN_SHARE = 12, 2 / 3
 _MAX_RESTART = 40  # samples of a restart
 _MAX_CHAIN_WINDOW = 64  # samples of a restart, with those of the newest frame
 _MAX_TURN_RAD = 0.3  # bound of the inflation of attitude
@@ -67,8 +66,10 @@ class ImuInflation:
 
 @dataclass(frozen=True, eq=False)
 class _RejectedSample:
-    """A rejected, suspect or retracted sample: the axes (6,) to ignore, its deviation (6,) and how long
-    that may last."""
+    """A rejected, suspect or retracted sample.
+
+    axes (6,): to ignore. excess (6,): its deviation, rad/s and m/s^2. duration_ns: how long that may last.
+    """
 
     stamp_ns: int
     axes: NDArray[np.bool_]
@@ -78,8 +79,7 @@ class _RejectedSample:
 
 @dataclass(eq=False)
 class _RestartWindow:
-    """Samples since the first one, or since the first after a gap: stamps, values (6,), and which are
-    accepted.
+    """Samples since the first, or the first after a gap: stamps, values (6,), and which are accepted.
 
     before_gap: stamp and value of the last accepted sample before the gap, if there was one.
     """
@@ -154,7 +154,7 @@ class ImuOutlierDetector:
             stamp_ns = int(stamps_ns[k])
             self._restart_after_gap(stamp_ns)
             if self._restart_window is None:
-                accepted[k] = self._check_sample(stamp_ns, self._newest, values[k])
+                accepted[k] = self._check_sample(stamp_ns, values[k])
                 k += 1
             else:
                 end = _end_before_gap(stamps_ns, k, _MAX_CHAIN_WINDOW - len(self._restart_window.stamps))
@@ -240,7 +240,7 @@ class ImuOutlierDetector:
                 )
                 self._note_newest(int(stamps[first]), all_values[first])
             for n in range(max(0, first - known_count + 1), len(values)):
-                accepted[n] = self._check_sample(int(stamps_ns[n]), self._newest, values[n])
+                accepted[n] = self._check_sample(int(stamps_ns[n]), values[n])
         self._extend_restart(window, stamps_ns, values, accepted)
         return accepted
 
@@ -309,9 +309,10 @@ class ImuOutlierDetector:
                 _RejectedSample(now_ns, _NO_AXES, np.abs(window.values[n] - reference), step_ns)
             )
 
-    def _check_sample(self, stamp_ns: int, newest: tuple[int, F64] | None, value: F64) -> bool:
-        """Return whether the sample is accepted."""
-        assert newest is not None
+    def _check_sample(self, stamp_ns: int, value: F64) -> bool:
+        """Return whether the sample, not the first of all, is accepted."""
+        assert self._newest is not None
+        newest = self._newest
         self._note_newest(stamp_ns, value)
         step_ns = stamp_ns - newest[0]
         step = np.abs(value - self._accepted_value)
@@ -357,7 +358,7 @@ class ImuOutlierDetector:
         self._run_steps.clear()
 
     def _extend_run(self, stamp_ns: int, value: F64, step: F64) -> None:
-        """Accept this sample; a run of outliers, some of which fit by chance, goes on."""
+        """Accept this sample. A run of outliers that has just paused goes on: some of them fit by chance."""
         if self._run_start_ns is None or stamp_ns - self._run_end_ns > _MAX_GAP_NS:
             self._restart_from(
                 stamp_ns, value, np.concatenate([self._recent_steps, step[None]])[-_RECENT_STEPS:]
@@ -367,8 +368,7 @@ class ImuOutlierDetector:
 
 
 def _end_before_gap(stamps_ns: I64, first: int, max_count: int) -> int:
-    """Return the end of the samples from index `first` on without a gap between them, at most `max_count`
-    of them."""
+    """Return the end of the samples from index `first` on without a gap, of at most `max_count` of them."""
     near = np.diff(stamps_ns[first : first + max_count]) <= _MAX_GAP_NS
     return first + 1 + (len(near) if near.all() else int(near.argmin()))
 

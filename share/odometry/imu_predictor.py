@@ -13,7 +13,7 @@ from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.odometry import filter
-from share.odometry.imu_outliers import ImuInflation, ImuOutlierDetector
+from share.odometry.imu_outliers import ImuOutlierDetector
 from share.odometry.imu_propagation import integrate, noise_with_vibration, noise_without_axes, scaled_noise
 from share.odometry.state import FilterState
 from share.types import F64, ImuBatch
@@ -29,50 +29,36 @@ _MIN_FULL_SCALE = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2; every scale ends
 
 
 class ImuBuffer:
-    """IMU samples of the last few seconds in order of time, without outliers (`ImuOutlierDetector`)."""
+    """IMU samples of the last few seconds in order of time, without those that `outliers` has rejected."""
 
     def __init__(self) -> None:
         self.samples = ImuBatch.empty()
         self.max_abs = np.zeros(6)  # of each axis, over all time
-        self._outliers = ImuOutlierDetector()
+        self.outliers = ImuOutlierDetector()
 
     def add(self, imu: ImuBatch) -> None:
         """Add samples; those not later than the newest are dropped."""
-        start = int(np.searchsorted(imu.stamps_ns, self._outliers.newest_ns, side="right"))
+        start = int(np.searchsorted(imu.stamps_ns, self.outliers.newest_ns, side="right"))
         imu = imu.take(slice(start, None)) if start else imu
         values = np.hstack([imu.gyro, imu.accel])
-        accepted = self._outliers.accepted_mask(imu.stamps_ns, values)
+        accepted = self.outliers.accepted_mask(imu.stamps_ns, values)
         if accepted is not None:
             imu, values = imu.take(accepted), values[accepted]
-        if self._outliers.retracted_ns:
-            self._remove(self._outliers.retracted_ns)
+        if self.outliers.retracted_ns:
+            self._remove(self.outliers.retracted_ns)
         self.max_abs = np.abs(values).max(axis=0, initial=0.0).clip(self.max_abs)
         self.samples = self.samples.take(slice(-_MAX_SAMPLES, None)).concatenate(imu)
 
     def extended(self, imu: ImuBatch) -> ImuBuffer:
         """Return a buffer with later samples added; this one does not change."""
         out = ImuBuffer()
-        out.samples, out.max_abs, out._outliers = self.samples, self.max_abs, self._outliers.copy()
+        out.samples, out.max_abs, out.outliers = self.samples, self.max_abs, self.outliers.copy()
         out.add(imu)
         return out
 
     def _remove(self, stamps_ns: list[int]) -> None:
         self.samples = self.samples.take(~np.isin(self.samples.stamps_ns, stamps_ns))
         self.max_abs = np.abs(np.hstack([self.samples.gyro, self.samples.accel])).max(axis=0, initial=0.0)
-
-    @property
-    def rejected_count(self) -> int:
-        """The number of samples rejected."""
-        return self._outliers.rejected_count
-
-    def is_suspect(self, now_ns: int) -> bool:
-        """Return whether recent samples may be wrong although they were accepted."""
-        return self._outliers.is_suspect(now_ns)
-
-    def inflation(self, from_ns: int, to_ns: int) -> ImuInflation | None:
-        """Return the inflation for rejected or suspect samples in [from_ns, to_ns); None where there are
-        none."""
-        return self._outliers.inflation(from_ns, to_ns)
 
     @property
     def last_ns(self) -> int:
@@ -138,11 +124,6 @@ def constant_velocity_samples(state: FilterState, rate: F64, to_ns: int, gravity
     return ImuBatch(stamps, np.tile(rate + state.bg, (2, 1)), np.tile(force + state.ba, (2, 1)))
 
 
-def gyro_only_samples(state: FilterState, imu: ImuBatch, to_ns: int, gravity: float) -> ImuBatch:
-    """Return samples of a body that turns as measured, at constant velocity."""
-    return constant_velocity_samples(state, imu.gyro.mean(axis=0) - state.bg, to_ns, gravity)
-
-
 def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
     """Return the mean rate (3,) rad/s, in the body, between two poses (4, 4)."""
     out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
@@ -150,15 +131,18 @@ def mean_angular_rate(before: F64, after: F64, dt_ns: int) -> F64:
 
 
 _MAX_REST_RATE = 0.03  # rad/s
-_SILENT_NS = 100_000_000  # the IMU counts as silent after this long without a sample; then
-_TURNING_NOISE = 0.5  # rad/s/sqrt(Hz) is the process noise of the angular rate,
-_MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz) that of the velocity
+_SILENT_NS = 100_000_000  # time without a sample after which the IMU counts as silent
+# Process noise of a prediction at constant velocity: of the angular rate and of the velocity.
+_TURNING_NOISE = 0.5  # rad/s/sqrt(Hz)
+_MOVING_NOISE = 1.0  # m/s^2/sqrt(Hz)
 
 
-class ImuUse(NamedTuple):
-    """The basis of a prediction: has_gyro, the gyro measured all axes; has_samples, the IMU was not
-    silent; has_rejected, some of its samples were rejected; is_still, it measured what it does at rest and at
-    constant velocity."""
+class ImuStatus(NamedTuple):
+    """What the IMU gave for a prediction.
+
+    has_samples: it was not silent. has_gyro: its gyroscope measured all axes. has_rejected: some samples were
+    rejected. is_still: it measured what it does at rest, or at constant velocity.
+    """
 
     has_gyro: bool
     has_samples: bool
@@ -185,26 +169,26 @@ class ImuPredictor:
         gyro = self.buffer.samples.gyro
         self.rate = gyro[-1] - state.bg if len(gyro) else np.zeros(3)
 
-    def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuUse:
+    def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuStatus:
         """Propagate the state to `to_ns`, IMU time.
 
         gyro_only: at constant velocity, for a single camera whose scale is unknown.
         """
-        inflation = self.buffer.inflation(s.stamp_ns, to_ns)
+        inflation = self.buffer.outliers.inflation(s.stamp_ns, to_ns)
         has_rejected = inflation is not None and bool(inflation.rejected_axes.any())
         if to_ns <= s.stamp_ns:
-            return ImuUse(True, True, has_rejected)
+            return ImuStatus(True, True, has_rejected)
         samples, gravity = self.samples(s.stamp_ns, to_ns), self._gravity
         if samples is None:
             substitute = constant_velocity_samples(s, self.rate, to_ns, gravity)
             filter.propagate(s, substitute, to_ns, self._constant_velocity, gravity)
-            return ImuUse(False, False, has_rejected)
+            return ImuStatus(False, False, has_rejected)
         if gyro_only:
             noise = noise_without_axes(self.noise, self._constant_velocity, np.arange(6) >= 3)
-            self.rate = filter.propagate(
-                s, gyro_only_samples(s, samples, to_ns, gravity), to_ns, noise, gravity
-            )
-            return ImuUse(True, True, has_rejected)
+            mean_rate = samples.gyro.mean(axis=0) - s.bg
+            substitute = constant_velocity_samples(s, mean_rate, to_ns, gravity)
+            self.rate = filter.propagate(s, substitute, to_ns, noise, gravity)
+            return ImuStatus(True, True, has_rejected)
         is_clipped = self.buffer.is_clipped(samples)
         silent_axes = is_clipped if inflation is None else is_clipped | inflation.rejected_axes
         noise = noise_with_vibration(self.noise, self.buffer.latest(to_ns))
@@ -214,7 +198,7 @@ class ImuPredictor:
         if inflation is not None:
             filter.inflate(s, inflation.turn_rad, 0.0, inflation.speed_m_s)
         is_still = inflation is None and self._is_still(to_ns)
-        return ImuUse(not silent_axes[:3].any(), True, has_rejected, is_still)
+        return ImuStatus(not silent_axes[:3].any(), True, has_rejected, is_still)
 
     def _is_still(self, now_ns: int) -> bool:
         return bool(np.linalg.norm(self.rate) < _MAX_REST_RATE) and self.buffer.is_still(now_ns)

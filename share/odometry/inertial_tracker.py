@@ -19,14 +19,14 @@ from share.odometry import filter, initialisation, relocalisation, visual_update
 from share.odometry.feature_appearance import Appearance
 from share.odometry.feature_matching import FeatureMatches
 from share.odometry.health import (
-    BLIND,
-    WEAK,
+    MIN_OK_FEATURES,
+    MIN_POSE_FEATURES,
     DivergenceMonitor,
     ImageImuConsistency,
     is_plausible,
     pose_state,
 )
-from share.odometry.imu_predictor import ImuPredictor, ImuUse, mean_angular_rate
+from share.odometry.imu_predictor import ImuPredictor, ImuStatus, mean_angular_rate
 from share.odometry.keyframes import KeyframeWork
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
@@ -46,11 +46,11 @@ from share.types import (
     WaitReason,
 )
 from share.vision import corners
-from share.vision.orb import measures_depth
+from share.vision.depth import measures_depth
 
 _LONG_GAP_NS = 250_000_000  # between frames; integration over more is worse than the IMU's noise model says
 _MAX_IMU_WAIT_FRAMES = 10  # without an IMU sample, after which the tracker begins without IMU
-_MIN_PROVEN = WEAK // 2  # static features that are proven, without which no first pose is published
+_MIN_PROVEN = MIN_OK_FEATURES // 2  # proven static features, without which no first pose is published
 _ZERO_VELOCITY_SIGMA = 0.02  # m/s, at rest
 _MAX_UP_SIGMA_RAD = np.radians(3.0)  # tilt sigma up to which the up direction is published
 
@@ -141,8 +141,8 @@ class InertialTracker:
     def finish_keyframe(self) -> None:
         """Run a slice of the pending keyframe work: new features, the local map.
 
-        Call it when the pose, and the candidate if there is one, are sent; otherwise the next `track` calls
-        it first.
+        Call it when the pose, and the keyframe if one is ready, are sent; otherwise the next `track` calls it
+        first.
         """
         if self._landmarks is None or self._last_frame is None or self._is_finished:
             return
@@ -168,7 +168,7 @@ class InertialTracker:
     @property
     def rejected_imu_samples(self) -> int:
         """The number of IMU samples rejected."""
-        return self._imu.buffer.rejected_count
+        return self._imu.buffer.outliers.rejected_count
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """Return T_odom_body (4, 4) at a time after the last frame's, IMU time, for renderers between frames;
@@ -202,7 +202,7 @@ class InertialTracker:
         landmarks = LandmarkMap(state, self._rig, self._config)
         self._imu.restart(state)
         self._keyframes.add_and_finish(frame, landmarks, self._imu.rate)
-        if len(state.feature_ids) < WEAK:
+        if len(state.feature_ids) < MIN_OK_FEATURES:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.VIEW)
         self._adopt_state(landmarks, new_segment=T_odom_cam is None)
         count = len(state.feature_ids)
@@ -256,7 +256,7 @@ class InertialTracker:
         imu = self._predict(frame, s)
         matches = landmarks.match_features(frame, last_frame.image0, interval_ns * 1e-9)
         visual_update.mark_dynamic(landmarks, matches, self._rig.cam0, self._imu.rate)
-        if self._rest.is_at_rest(s, matches.at, matches.is_found & ~matches.is_dynamic, imu.is_still):
+        if self._rest.is_at_rest(s, matches.uv, matches.is_found & ~matches.is_dynamic, imu.is_still):
             filter.zero_velocity_update(s, _ZERO_VELOCITY_SIGMA)
         inliers, nis = self._update(landmarks, matches, interval_ns)
         count = int(inliers.sum())
@@ -264,7 +264,7 @@ class InertialTracker:
             self._imu.rate = mean_angular_rate(T_before, s.T, interval_ns)
         elif self._mono_window is None:
             self._consistency.add(nis, interval_ns * 1e-9)
-        is_textured = count >= BLIND or corners.count_fast(frame.image0) >= WEAK
+        is_textured = count >= MIN_POSE_FEATURES or corners.count_fast(frame.image0) >= MIN_OK_FEATURES
         if not self._check_health(s, matches, count, is_textured, interval_ns):
             return self._declare_lost(frame)
         state = self._track_state(s, count, imu)
@@ -279,7 +279,7 @@ class InertialTracker:
         found_count = int((matches.is_found | inliers).sum())
         return replace(result, found_count=found_count, median_nis=finite_median(nis))
 
-    def _predict(self, frame: Frame, s: FilterState) -> ImuUse:
+    def _predict(self, frame: Frame, s: FilterState) -> ImuStatus:
         """Propagate the state to the time of the frame's image."""
         image_ns = frame.stamp_ns + round(s.timeshift_s * 1e9)  # IMU time
         return self._imu.predict(s, image_ns, gyro_only=self._mono_window is not None)
@@ -290,7 +290,7 @@ class InertialTracker:
         """Update state and features with the matches. Return the inliers (N,) and the NIS of the
         measurements."""
         is_after_gap = interval_ns > _LONG_GAP_NS
-        is_suspect = self._imu.buffer.is_suspect(landmarks.state.stamp_ns)
+        is_suspect = self._imu.buffer.outliers.is_suspect(landmarks.state.stamp_ns)
         inliers, nis = visual_update.update(
             landmarks, matches, self._rig.cam0, self._imu.rate, is_after_gap, is_suspect
         )
@@ -334,7 +334,7 @@ class InertialTracker:
             cov = se3.compose_cov(se3.inverse(s.T_origin) @ s.T, self._start_cov, cov)
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
-            self._keyframes.add(frame, landmarks, self._imu.rate, count < WEAK, publish)
+            self._keyframes.add(frame, landmarks, self._imu.rate, count < MIN_OK_FEATURES, publish)
         is_ready = self._keyframes.is_ready
         return TrackResult(
             state,
@@ -348,7 +348,7 @@ class InertialTracker:
             angular_velocity=self._imu.rate.copy(),
         )
 
-    def _track_state(self, s: FilterState, count: int, imu: ImuUse) -> TrackState:
+    def _track_state(self, s: FilterState, count: int, imu: ImuStatus) -> TrackState:
         has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)
         if self._mono_window is not None or (
             has_imu and not self._has_published and not self._is_publishable(s, count)
@@ -364,7 +364,7 @@ class InertialTracker:
 
     def _sees_the_room(self, count: int) -> bool:
         is_static = self._landmarks is None or self._landmarks.is_static(_MIN_PROVEN)
-        return is_static and count >= BLIND
+        return is_static and count >= MIN_POSE_FEATURES
 
     def _waiting_result(self, s: FilterState, count: int) -> TrackResult:
         if self._mono_window is not None:

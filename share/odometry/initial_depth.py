@@ -1,8 +1,8 @@
 """Initial inverse depth of new features: measured by stereo or a depth camera, else about that of features
 near them.
 
-Without a measurement, new features share the scale error of their neighbours, and are as uncertain of it:
-treated as independent guesses, a hundred of them would fix the scale at that of an average room.
+Without a measurement, new features share the scale error of their neighbours. Treated as independent guesses,
+a hundred of them would fix the scale at that of an average room.
 """
 
 from __future__ import annotations
@@ -16,8 +16,14 @@ from share.geometry.camera import Rig, rays
 from share.odometry.feature_matching import anchors_in_camera
 from share.odometry.state import FilterState
 from share.types import F32, F64, U8, Frame
-from share.vision.depth import MIN_RHO, disparity_per_rho, from_depth_camera, from_stereo, search_depth
-from share.vision.orb import measures_depth
+from share.vision.depth import (
+    MIN_RHO,
+    disparity_per_rho,
+    from_depth_camera,
+    from_stereo,
+    measures_depth,
+    search_depth,
+)
 
 MEAN_RHO = 0.4  # 1/m, where nothing is known
 ROOM_LOG_SIGMA = 0.8  # sigma of the logarithm of a room's inverse depth

@@ -129,8 +129,8 @@ def _update_with_rate(state: FilterState, rate: F64) -> None:
 
 _MAX_TILT_SIGMA_RAD = np.radians(3.0)
 _MAX_SPEED_SIGMA_M_S = 0.3
-_MAX_TILT_DRIFT_M_S = 0.03  # drift by the uncertain tilt: with more, the first pose waits,
-_MAX_TILT_WAIT_S = 0.9  # for so long
+_MAX_TILT_DRIFT_M_S = 0.03  # drift by the uncertain tilt; with more, the first pose waits
+_MAX_TILT_WAIT_S = 0.9  # that it waits at most
 _LEARNT_SIGMA_RATIO = 0.3  # of an unknown bias's sigma
 
 
@@ -151,9 +151,9 @@ def is_publishable(s: FilterState, waited_s: float, new_segment: bool) -> bool:
     """Return whether a first pose can be published, `waited_s` after the filter began. new_segment: odom
     begins with it.
 
-    A body at rest gets its pose at once. The path of a moving body would climb or sink by the tilt that looks
-    like a bias, until rotation separates the two, mostly within a second: its pose waits for that, at most
-    `_MAX_TILT_WAIT_S`, which a body that moves straight on needs.
+    A body at rest gets its pose at once. The path of a moving body would climb or sink by a tilt that is
+    taken for a bias. Rotation separates the two, mostly within a second, so its pose waits for that; for a
+    body that moves straight on, `_MAX_TILT_WAIT_S`.
     """
     drifts = tilt_sigma(s) * np.linalg.norm(s.v) > _MAX_TILT_DRIFT_M_S
     return has_converged(s) and not (drifts and new_segment and waited_s < _MAX_TILT_WAIT_S)

@@ -1,9 +1,9 @@
 """Keyframes of a tracker with IMU: when to make one, what is published of it, and its work, in slices.
 
-A keyframe's pose joins the state at once, and what is published of it is known. All else is done after the
-poses of this frame and the next ones are published, one slice a frame (more at low frame rates), so that no
-frame waits for all of it: reactivation of dormant features, corners in free areas, and their depth. New
-features are searched from a fixed frame on, however long a slice takes.
+A keyframe's pose joins the state at once. The rest of its work, reactivation of dormant features, corners in
+free areas and their depth, is split into slices. One slice runs after each frame's pose is published (more at
+low frame rates), so that no frame waits for all of them. Which slice runs after which frame depends on stamps
+alone, not on how long a slice takes.
 """
 
 from __future__ import annotations
@@ -32,10 +32,8 @@ KEYFRAME_GAP_NS = 100_000_000  # least time between keyframes
 
 class KeyframeSpacing:
     """Decides when a frame is far enough from the newest keyframe, by poses (4, 4) of the body or of the
-    camera.
-
-    distance_m, angle_rad: after more motion than this. min_share: or with less than this part of the newest
-    keyframe's features left.
+    camera: it has moved by more than distance_m or angle_rad, or has less than min_share of the newest
+    keyframe's features.
     """
 
     def __init__(self, distance_m: float, angle_rad: float, min_share: float) -> None:
@@ -57,11 +55,11 @@ class KeyframeSpacing:
 
 
 class LastPublishedKeyframe:
-    """The last published keyframe, for the motion since then by the state's present estimate.
+    """The last published keyframe, and the motion since then by the present state.
 
-    The filter corrects a keyframe's pose after its publication, at first mostly the tilt, by degrees. The
-    difference of published poses would show that as a rotation of the body. keyframe_id: -1 if the state does
-    not have it.
+    The filter still corrects a keyframe's pose after its publication, at first mostly the tilt, by degrees.
+    In the difference of published poses that would look like a rotation of the body. keyframe_id: -1 if the
+    state does not have it.
     """
 
     def __init__(self) -> None:
@@ -111,7 +109,8 @@ class PublishedKeyframe(NamedTuple):
 
 
 class OfferedKeyframe(NamedTuple):
-    """A keyframe whose candidate was made; it counts as published unless making the candidate fails."""
+    """A keyframe that `publish` returned. It counts as published with the next frame: until then the caller
+    may still fail."""
 
     frame: Frame
     keyframe_id: int
@@ -154,7 +153,7 @@ class KeyframeWork:
     def wants_keyframe(self, stamp_ns: int, T_odom_body: F64, inlier_count: int) -> bool:
         """Return whether the frame just tracked, with `inlier_count` features, is to be a keyframe."""
         steps = (step for group in self._slices for step, _ in group)
-        return self._add_features not in steps and self._spacing.wants_keyframe(
+        return self._admit_features not in steps and self._spacing.wants_keyframe(
             stamp_ns, T_odom_body, inlier_count
         )
 
@@ -182,7 +181,7 @@ class KeyframeWork:
             slices: list[Slice] = [
                 [(self._reactivate, pending), (self._find_peaks, pending)],
                 [(self._find_corners, pending)],
-                [(self._add_features, pending)],
+                [(self._admit_features, pending)],
             ]
             steps = [step for group in slices for step in group]
             if not urgent:
@@ -225,18 +224,18 @@ class KeyframeWork:
         return EarlierPoses(np.array(stamps_ns, np.int64), T.astype(np.float32), cov.astype(np.float32))
 
     def process_pending(self, landmarks: LandmarkMap, frame: Frame, rate: F64) -> OfferedKeyframe | None:
-        """Run the slices that there is time for after `frame`, the frame just tracked; at least one, but none
-        beside publishing, which takes the time of one. Once a frame.
+        """Run the slices that there is time for after `frame`, the one just tracked: at least one, less the
+        one that publishing a keyframe takes the time of. Call it once a frame.
 
-        Return the keyframe offered since the last call, if any.
+        Return the keyframe that was offered since the last call, if any.
         """
         offered, self._offered = self._offered, None
         if offered is not None:
-            # Not before: making its candidate might have failed.
+            # Not before: the caller might have failed after `publish`.
             self._last_published.update(landmarks.state, offered.keyframe_id)
             self._published[offered.keyframe_id] = offered.frame.stamp_ns
         slices = max(1, self._slice_count(frame))
-        if self._to_publish is not None:  # it was published, or not asked for
+        if self._to_publish is not None:  # published, or the caller did not want it
             self._to_publish = None
             slices -= 1
         self._processed_ns = frame.stamp_ns
@@ -271,7 +270,7 @@ class KeyframeWork:
     def _find_peaks(
         self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
     ) -> None:
-        if landmarks.has_free_slots():
+        if landmarks.free_slots():
             pending.peaks.find_half()
 
     def _find_corners(
@@ -279,7 +278,7 @@ class KeyframeWork:
     ) -> None:
         pending.corners = landmarks.find_corners(pending.frame, pending.occupied_px, pending.peaks)
 
-    def _add_features(
+    def _admit_features(
         self, pending: _PendingKeyframe, landmarks: LandmarkMap, last_frame: Frame, rate: F64
     ) -> None:
         landmarks.admit_features(pending.frame, pending.keyframe_id, pending.corners)

@@ -26,22 +26,21 @@ from share.odometry.state import GYRO_BIAS, FilterState
 from share.types import F32, F64, I64, U8, FeatureStatistics, Frame
 from share.vision import corners
 from share.vision.corners import CornerPeaks, field_mask
-from share.vision.depth import MIN_RHO
+from share.vision.depth import MIN_RHO, measures_depth
 from share.vision.keyframe_images import Surfaces
-from share.vision.orb import measures_depth
 
-LASTING_PX = 0.3  # persistent error of a feature: edges, patches seen from elsewhere
+CORRELATED_SIGMA_PX = 0.3  # error of a feature that lasts: edges, patches seen from elsewhere
 _SPACING_PX = 18.0  # least distance between new features
 _GRAY_NOISE = 3.0  # gray levels of an image
 _MAX_PATCH_SIGMA_PX = 0.5  # error of a patch's position by image noise; with more it is no feature
 _AVOID_FRAMES = 30  # for which no feature is searched where a dynamic feature was
-_MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution,
-_CAUTION_FRAMES = 60  # frames of it after the last such frame
+_MIN_DYNAMIC = 5  # dynamic features in a frame that begin a time of caution
+_CAUTION_FRAMES = 60  # length of that time, after the last such frame
 _PROBATION_S = 0.34  # after which a static feature is proven
 _SUSPECT_NOISE_SCALE = 5.0  # of the sigma of a feature that may move
 _UNKNOWN_BIAS_SIGMA = 2e-3  # rad/s, of the gyroscope; with more, rotation may pass for translation
 _NEAR_RATIO = 2.0  # of a near feature's inverse depth to the median
-_MAX_NEAR_SHARE = 0.25  # of the features; more than these are a part of the room
+_MAX_NEAR_SHARE = 0.25  # of the features; if more are near, they are a part of the room
 _SLANT_PERIOD = 4  # frames between updates of a feature's slant
 _MIN_DEPTH_M = 0.2
 _UNKNOWN_RHO_SIGMA = 0.05  # 1/m; half a pixel a frame at walking speed
@@ -172,13 +171,13 @@ class LandmarkMap:
         present state."""
         used = matches.is_found & ~matches.is_dynamic
         indices, in_cam1 = np.flatnonzero(used), None
-        measured_uv = matches.at[indices]
+        measured_uv = matches.uv[indices]
         if (stereo := matches.cam1) is not None:
             used_in_cam1 = used[stereo.feature]
             cam1_indices = stereo.feature[used_in_cam1]
             in_cam1 = np.arange(len(indices) + len(cam1_indices)) >= len(indices)
             indices = np.concatenate([indices, cam1_indices])
-            measured_uv = np.concatenate([measured_uv, stereo.at[used_in_cam1]])
+            measured_uv = np.concatenate([measured_uv, stereo.uv[used_in_cam1]])
         order = np.argsort(self.state.anchor[indices], kind="stable")
         in_cam1 = None if in_cam1 is None else in_cam1[order]
         return self._with_inflated_noise(
@@ -199,7 +198,7 @@ class LandmarkMap:
             predicted, uv = self._in_image_plane(
                 predicted, uv, np.zeros(len(indices), bool) if in_cam1 is None else in_cam1
             )
-        sigma, correlated_sigma = self.sigma_px / focal, LASTING_PX / focal
+        sigma, correlated_sigma = self.sigma_px / focal, CORRELATED_SIGMA_PX / focal
         return filter.feature_measurements(s, indices, predicted, uv, sigma, correlated_sigma, rate)
 
     def _in_image_plane(
@@ -254,26 +253,19 @@ class LandmarkMap:
     def find_corners(self, frame: Frame, occupied_px: F32, peaks: CornerPeaks | None = None) -> F32:
         """Return px (N, 2) of corners for new features of a keyframe, away from occupied_px (M, 2), best
         first; peaks: of its image, if some are known."""
-        max_count = self._config.features if self.has_free_slots() else 0
+        max_count = self._config.features if self.free_slots() else 0
         mask = field_mask(self._rig.cam0)
         return corners.detect(frame.image0, occupied_px, max_count, _SPACING_PX, mask, peaks)
 
-    def has_free_slots(self) -> bool:
-        """Return whether features may be added."""
-        return self._free_slots() > 0
+    def free_slots(self) -> int:
+        """Return the number of features that may be added."""
+        return max(self._config.features - len(self.state.feature_ids), 0)
 
     def admit_features(self, frame: Frame, keyframe_id: int, px: F32) -> None:
         """Add features at px (N, 2) of `frame`, the keyframe with this id; the last frame may be a later
         one."""
-        anchor, free_slots = filter.keyframe_index(self.state, keyframe_id), self._free_slots()
-        self._add_features(frame, anchor, px[:free_slots])
-
-    def _free_slots(self) -> int:
-        """Return the number of features that may be added."""
-        return max(self._config.features - len(self.state.feature_ids), 0)
-
-    def _add_features(self, frame: Frame, anchor: int, px: F32) -> None:
-        camera, s = self._rig.cam0, self.state
+        camera, s, px = self._rig.cam0, self.state, px[: self.free_slots()]
+        anchor = filter.keyframe_index(s, keyframe_id)
         ray = camera.normalise(px.astype(np.float64))
         prior = initial_depth.initial_depths(frame, self._rig, s, px, ray, self.appearance.last_px)
         appearance = feature_appearance.extract_appearance(
@@ -318,7 +310,7 @@ class LandmarkMap:
         )
         matches = feature_matching.match_features(frame, self._rig, means, dormant.appearance, cam0_only=True)
         found = np.flatnonzero(matches.is_found)
-        rows = self._measurements(means, found, matches.at[found], None, rate)
+        rows = self._measurements(means, found, matches.uv[found], None, rate)
         recognised = found[dormant_features.nis(self.state, rows, dormant.sigma[found]) < filter.GATE]
         dormant.appearance.last_px[recognised] = matches.px[recognised]
         return dormant.take(recognised)
@@ -363,9 +355,9 @@ class LandmarkMap:
 
 
 def _near_few(rho: F64) -> NDArray[np.bool_]:
-    """Return which features (N,) with inverse depths rho are much nearer than most, if they are few.
+    """Return which features (N,) with inverse depths rho are much nearer than most; none if they are many.
 
-    They say the most about translation: one who stands before the camera and sways outweighs a room.
+    Near features say the most about translation: a person who sways before the camera outweighs the room.
     """
     if not len(rho):
         return np.zeros(0, bool)

@@ -12,7 +12,7 @@ from share.geometry.camera import Camera, ImuNoise, rays
 from share.odometry import filter, mono_bundle
 from share.odometry.feature_matching import anchors_in_camera
 from share.odometry.initial_depth import FEATURE_SPREAD, MEAN_RHO, ROOM_LOG_SIGMA
-from share.odometry.landmarks import LASTING_PX, LandmarkMap
+from share.odometry.landmarks import CORRELATED_SIGMA_PX, LandmarkMap
 from share.odometry.mono_bundle import FRAME_SIZE, BundleModel, BundleSolution, WindowFrame
 from share.odometry.state import CORE_SIZE, EXTRINSIC, ORIGIN, FilterState
 from share.odometry.visual_update import COMMON_COV
@@ -24,9 +24,10 @@ _MIN_FRAMES = 12  # before the first fit
 _MIN_PARALLAX_PX = 2.0  # of at least a quarter of the features, without rotation, for a fit
 _MAX_WINDOW_NS = 2_500_000_000
 _NOISE_SCALE = 2.0  # of a coordinate's sigma, because errors of a patch last from frame to frame
-_MAX_SCALE_SIGMA = 0.03  # relative, for a fit to be accepted,
-_MIN_BASELINE_PX = 15.0  # baseline over depth, times the focal length,
-_MAX_COST = 1.0  # and mean cost of an observation, squared sigmas
+# A fit is accepted with
+_MAX_SCALE_SIGMA = 0.03  # relative
+_MIN_BASELINE_PX = 15.0  # baseline over depth, times the focal length
+_MAX_COST = 1.0  # mean of an observation, squared sigmas
 _UNKNOWN_SCALE_SIGMA = 0.1  # relative
 _GAUGE_SIGMA = 1e-3  # rad, 1/m
 
@@ -35,7 +36,7 @@ class MonoWindow:
     """Frames since the first keyframe."""
 
     def __init__(self, first: FilterState, camera: Camera, noise: ImuNoise, config: InertialConfig) -> None:
-        sigma = _NOISE_SCALE * float(np.hypot(config.sigma_px, LASTING_PX)) / camera.focal
+        sigma = _NOISE_SCALE * float(np.hypot(config.sigma_px, CORRELATED_SIGMA_PX)) / camera.focal
         self._first, self._camera = copy.deepcopy(first), camera
         self._model = BundleModel(
             noise, config.gravity, sigma, COMMON_COV, MEAN_RHO, ROOM_LOG_SIGMA, FEATURE_SPREAD

@@ -16,13 +16,13 @@ from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
 from share.vision.matching import match_descriptors
 from share.vision.orb import detect_orb, image_view
 
-# Pose of a camera from known points: RANSAC, then weighted least squares.
+# Pose of a camera from known points: RANSAC, then weighted least squares
 
 RANSAC_PX = 3.0  # reprojection error of a RANSAC inlier
 NOISE_PX = 1.0  # standard deviation of a point's position in an image
 GATE_SIGMA = 3.0  # a measurement further off is an outlier
-NEW_SEGMENT_S = 3.0  # LOST for this long: odometry starts a new segment
 MIN_INLIERS = 15  # points that agree with a pose; with fewer there is none
+_MAX_ITERATIONS = 8  # of a refinement
 POSE_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad^2, m^2: of a pose by ORB features
 
 
@@ -98,9 +98,10 @@ def reprojection_residuals(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F6
     return (projected - uv) * scale[:, None], J
 
 
+# The local map
+
 _BORDER_PX = 12.0  # of an image, in which no point is expected to be found
-_MAX_ITERATIONS = 8  # of a refinement
-MAX_KEYFRAMES = 60  # of the local map; a full one drops the keyframe closest to another
+MAX_KEYFRAMES = 60  # of the local map; a full one drops the older keyframe of its closest pair
 
 
 @dataclass(eq=False)
@@ -202,8 +203,9 @@ class LocalMap:
         self.anchors, self.anchor_px = self.anchors[keep], self.anchor_px[keep]
 
 
-# Relocalisation in the keyframes of the local map.
+# Relocalisation in the keyframes of the local map
 
+NEW_SEGMENT_S = 3.0  # LOST for this long: odometry starts a new segment
 VIEW_FEATURES = 500  # ORB features of a frame or keyframe
 MAX_HAMMING_BITS = 64  # of 256
 _BATCH_SIZE = 8  # keyframes that a LOST frame is matched with

@@ -116,11 +116,11 @@ def initial_state(
         np.zeros((0, 2)),
         np.zeros(0),
     )
-    begin_here(state)
+    set_origin(state)
     return state
 
 
-def begin_here(state: FilterState) -> None:
+def set_origin(state: FilterState) -> None:
     """Make the body's pose the origin."""
     state.T_origin = state.T.copy()
     state.cov[ORIGIN] = state.cov[POSE]
@@ -134,7 +134,7 @@ def move(state: FilterState, T: F64) -> None:
     J = np.eye(len(state.cov))
     J[POSE, POSE], J[VELOCITY, VELOCITY] = se3.adjoint(T_new_old), T_new_old[:3, :3]
     state.T, state.v, state.cov = T.copy(), T_new_old[:3, :3] @ state.v, J @ state.cov @ J.T
-    begin_here(state)
+    set_origin(state)
 
 
 def twist(state: FilterState, rate: F64) -> F64:

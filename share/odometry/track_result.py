@@ -15,11 +15,11 @@ class TrackResult:
 
     keyframe_ready: a keyframe is ready, of this frame or of one before; `make_keyframe` returns it.
     inlier_count: features that the pose is based on. new_segment: odometry began anew before this frame. cov
-    (6, 6): of T_odom_body, perturbed on the right, where the tracker knows it. is_consistent: False while
-    images and IMU contradict each other. waiting_for: where there is no pose yet. found_count: features
-    found, outliers included. median_nis: over the features; 0 without any. velocity (3,): of the body in
-    odom, m/s, and angular_velocity (3,): in the body, rad/s, where the tracker knows them. The covariance is
-    relative to where odom began, with the tilt that odom has kept since.
+    (6, 6): of T_odom_body since odom began, with the tilt that odom then had, perturbed on the right.
+    is_consistent: False while images and IMU contradict each other. waiting_for: what the first pose waits
+    for. found_count: features found, outliers included. median_nis: over the features; 0 without any.
+    velocity (3,): of the body in odom, m/s. angular_velocity (3,): in the body, rad/s. The covariance and the
+    velocities are None where the tracker does not know them.
     """
 
     state: TrackState

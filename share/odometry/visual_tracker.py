@@ -43,18 +43,18 @@ from share.types import (
 )
 from share.vision import corners, optical_flow
 from share.vision.corners import UNIFORM_FIELD_DEG, field_mask
+from share.vision.depth import measure_depth
 from share.vision.keyframe_images import Surfaces
-from share.vision.orb import measure_depth
 
 KEYFRAME_M, KEYFRAME_RAD = 0.15, 0.15  # motion since the last keyframe that triggers a new one
-_UP_SIGMA_RAD = float(np.radians(3.0))  # of a candidate's up, which is 0: not known
+_UP_SIGMA_RAD = float(np.radians(3.0))  # of a keyframe's up, which is 0: not known
 _SIGMA_RHO = 0.01  # 1/m, of a point's inverse depth
-_MIN_TRACKED_SHARE = 0.6  # a smaller share of its features still tracked triggers one too
+_MIN_TRACKED_SHARE = 0.6  # of the last keyframe's features; a smaller one triggers a new keyframe too
 _SPACING_PX = 14.0  # least distance between corners
 _WEAK_INLIERS = 40  # features that agree with a pose; fewer: WEAK
 _MAX_SPEED_M_S, _MAX_TURN_RAD_S = 5.0, 12.0  # a pose that implies a faster motion is rejected
-_REOBSERVED_KEYFRAMES = 6  # earlier keyframes whose points are searched for again,
-_REOBSERVE_M, _REOBSERVE_RAD = 1.0, 0.5  # at most so far away
+_REOBSERVED_KEYFRAMES = 6  # earlier keyframes whose points are searched for again
+_REOBSERVE_M, _REOBSERVE_RAD = 1.0, 0.5  # their largest distance
 _REOBSERVE_PX = 3.0  # largest distance between the predicted and the found position of such a point
 MIN_NCC = 0.8  # of a patch matched in an earlier keyframe
 MIN_POINTS_TO_MATCH = 8  # of an earlier keyframe; fewer are not worth an image pyramid
@@ -142,7 +142,7 @@ class VisualTracker:
         if self._offered is None:
             return
         (frame, surfaces), self._offered = self._offered, None
-        self._T_last_published = self._T_odom_body()  # not before: making its candidate might have failed
+        self._T_last_published = self._T_odom_body()  # not before: making the keyframe might have failed
         if self._keyframe_pending:
             self._add_keyframe(frame)
         self.local_map.set_surfaces(surfaces.with_image(None))

@@ -17,8 +17,8 @@ from share.geometry.camera import Camera, rays
 from share.odometry import filter
 from share.odometry.feature_matching import FeatureMatches
 from share.odometry.filter import FeatureMeasurements
-from share.odometry.health import WEAK
-from share.odometry.landmarks import LASTING_PX, LandmarkMap
+from share.odometry.health import MIN_OK_FEATURES
+from share.odometry.landmarks import CORRELATED_SIGMA_PX, LandmarkMap
 from share.odometry.state import POSE, FilterState, submatrix
 from share.odometry.track_result import median
 from share.types import F32, F64, I64
@@ -101,7 +101,7 @@ def _gate(
 def _images_agree(s: FilterState, matches: FeatureMatches, camera: Camera) -> bool:
     """Return whether nearly all matches in cam0 agree on a pose."""
     indices = np.flatnonzero(matches.is_found & ~matches.is_dynamic)
-    if len(indices) < WEAK:
+    if len(indices) < MIN_OK_FEATURES:
         return False
     inliers = consensus_inliers(s, indices, matches.px[indices], camera)
     return bool(inliers.mean() > _MIN_CONSENSUS_SHARE)
@@ -134,12 +134,12 @@ def mark_dynamic(landmarks: LandmarkMap, matches: FeatureMatches, camera: Camera
     """Mark dynamic features among the matches in cam0, in place, where the IMU alone does not explain the
     image. rate (3,): rad/s of the body."""
     indices = np.flatnonzero(matches.is_found)
-    residual = camera.to_image_plane(matches.at[indices]) - camera.to_image_plane(
+    residual = camera.to_image_plane(matches.uv[indices]) - camera.to_image_plane(
         matches.predicted_uv[indices]
     )
     if len(indices) == 0 or matches_imu(residual * camera.focal, landmarks.sigma_px):
         return
-    rows = landmarks.cam0_measurements(matches.at, indices, rate)
+    rows = landmarks.cam0_measurements(matches.uv, indices, rate)
     static = static_inliers(landmarks.state, rows, matches.px[indices], landmarks.is_proven(indices), camera)
     matches.is_dynamic[indices[~static]] = True
 
@@ -147,7 +147,7 @@ def mark_dynamic(landmarks: LandmarkMap, matches: FeatureMatches, camera: Camera
 def matches_imu(residual: F64, sigma_px: float) -> bool:
     """Return whether nearly all residuals (M, 2) px agree with the prediction, so that no consensus is
     needed."""
-    nis = (residual**2).sum(axis=1) / (sigma_px**2 + LASTING_PX**2)
+    nis = (residual**2).sum(axis=1) / (sigma_px**2 + CORRELATED_SIGMA_PX**2)
     return bool((nis < _INLIER_SIGMAS**2).mean() > 1 - _MAX_OUTLIER_SHARE)
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from math import ceil
 
 from share.config import EdgeConfig
 from share.mapping.loops import KeyframeKey
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.peer import Peer, RestoredRun, Sender
+from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
-from share.types import AgentKind
 from share.wire.messages import Hello, PoseUpdate, public_tag
 
 # Limits on new runs, each at once and a second: each run stays in the report, and in the map once it has a
@@ -52,16 +52,11 @@ class Admission:
     """Decides whether a run may join.
 
     tracks_agents: the edge tracks its agents (policy streamed), so agents must stream frames.
-    room_objection: why the room has no air for one more, by name, kind and time (`RateScheduler`)."""
+    rate_scheduler: its policy says whether the room has air for one more."""
 
-    def __init__(
-        self,
-        config: EdgeConfig,
-        tracks_agents: bool,
-        room_objection: Callable[[str, AgentKind, int], str | None],
-    ) -> None:
+    def __init__(self, config: EdgeConfig, tracks_agents: bool, rate_scheduler: RateScheduler) -> None:
         self._max_agents, self._tracks_agents = config.max_agents, tracks_agents
-        self._new_run_limits, self._room_objection = NewRunLimits(), room_objection
+        self._new_run_limits, self._rate_scheduler = NewRunLimits(), rate_scheduler
 
     def objection(
         self, event: PeerMessageReceived, hello: Hello, runs: RunRegistry, now_ns: int
@@ -102,7 +97,7 @@ class Admission:
                 return f"the name '{hello.name}' is in use by another agent; choose another with --name"
         if len(present) >= self._max_agents:
             return f"the edge already serves {len(present)} agents, its limit (edge.max_agents)"
-        return self._room_objection(hello.name, hello.kind, now_ns)
+        return self._rate_scheduler.policy.objection(hello.name, hello.kind, now_ns)
 
 
 def new_run_key(hello: Hello, used_keys: Collection[str]) -> str:

@@ -186,7 +186,7 @@ class AgentProtocol:
         self._finish_frame(frame, sent)
 
     def _send_evaluation(self, keyframe: int) -> None:
-        """Send delay and error with a keyframe, or between two if -1."""
+        """Send delay and error just before a keyframe, or between two (`NO_KEYFRAME`)."""
         self._evaluation_timer.postpone(self._now_ns + seconds_to_ns(EVALUATION_S))
         if self.is_connected and (evaluation := self.evaluation(keyframe, self._now_ns)) is not None:
             self._send(evaluation)
@@ -227,7 +227,7 @@ class AgentProtocol:
 
     def _on_ack(self, ack: m.Ack) -> None:
         if not self._ledger.acknowledge(ack):
-            self._is_of_sent("an acknowledgement", ack.next_keyframe - 1, *ack.buffered)
+            self._were_sent("an acknowledgement", ack.next_keyframe - 1, *ack.buffered)
             return
         acks_ms = self._self_evaluation.delay.acknowledge(ack.next_keyframe, self._now_ns)
         self._pace.acknowledge(acks_ms, self._now_ns)
@@ -238,7 +238,7 @@ class AgentProtocol:
     def _report_invalid(self, text: str) -> None:
         self._effects += self._connection.report_invalid(text, self._now_ns)
 
-    def _is_of_sent(self, message_name: str, *keyframes: int) -> bool:
+    def _were_sent(self, message_name: str, *keyframes: int) -> bool:
         """Return whether an edge can have these keyframes; report a message about others."""
         is_sent = max(keyframes, default=-1) < self._ledger.next_unsent_id
         if not is_sent:
@@ -246,7 +246,7 @@ class AgentProtocol:
         return is_sent
 
     def _on_welcome(self, welcome: m.Welcome) -> None:
-        if not self._is_of_sent("a welcome", welcome.next_keyframe - 1):
+        if not self._were_sent("a welcome", welcome.next_keyframe - 1):
             return
         is_restart = self._connection.sessions.session is not None
         outcome = self._connection.welcome(welcome)
@@ -266,12 +266,12 @@ class AgentProtocol:
         self._pings.begin_session()
         pending = self._ledger.begin_session(welcome)
         if is_restart:
-            self._print(f"the edge has restarted; {self._restart(pending)}")
+            self._print(f"the edge has restarted; {self._on_edge_restart(pending)}")
         else:
             self._print("connected to the edge")
 
-    def _restart(self, pending: int) -> str:
-        """Return what a restart of the edge means, for a person. pending: number of keyframes."""
+    def _on_edge_restart(self, pending: int) -> str:
+        """Adapt to a restarted edge; return what happens now, for a person. pending: number of keyframes."""
         return f"{pending} keyframes are resent"
 
     def _on_refused(self, refused: m.Refused) -> None:
@@ -285,7 +285,7 @@ class AgentProtocol:
 
     def _on_correction(self, correction: Correction) -> None:
         answered = correction.answered_keyframe
-        if not self._is_of_sent("a correction", correction.segment_keyframe, answered):
+        if not self._were_sent("a correction", correction.segment_keyframe, answered):
             return
         is_of_segment = correction.segment_keyframe >= self._keyframe_chain.first_of_segment
         is_current = self.is_connected and is_of_segment
@@ -327,7 +327,7 @@ class AgentProtocol:
             self._finish()
 
     def _send_data(self) -> None:
-        if self._pace.next_send_ns(self._now_ns) > self._now_ns:
+        if self._pace.is_holding(self._now_ns):
             return
         for entry in self._ledger.take_due(self._now_ns, self._pace.window):
             if entry.attempts == 1:

@@ -1,9 +1,9 @@
 """Troubles of an agent as its edge sees them: late poses, late corrections, a large error, a clock that
 is not synchronised, keyframes that are not acknowledged.
 
-A low QoE is no trouble: it is what scheduling steers, and falls with each millisecond until a correction.
-What the wearer sees is late by the age of its poses, and off by the error; a correction that takes 100 ms
-shows only by what the agent has drifted meanwhile, which its error counts.
+A low QoE is no trouble: scheduling controls it, and it falls with each millisecond of delay. What a wearer
+notices is the age of the poses and their error. A late correction shows only as drift until it comes, which
+the error includes.
 """
 
 from __future__ import annotations

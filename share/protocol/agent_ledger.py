@@ -280,9 +280,7 @@ class KeyframeChain:
             T_ref_body = candidate.T_odom_body
         else:
             earlier = self._earlier_keyframes(candidate.earlier)
-            if (
-                len(earlier) and earlier.ids[-1] == self.next_id - 1
-            ):  # more accurate than the candidates' chain
+            if len(earlier) and earlier.ids[-1] == self.next_id - 1:  # more accurate than the chain
                 T_ref_body = orthonormal(earlier.T_earlier_body[-1].astype(np.float64))
                 cov = earlier.cov[-1].astype(np.float64)
             earlier = select_earlier(earlier, self.next_id)
@@ -322,13 +320,13 @@ class KeyframeChain:
         self._T_keyframe_candidate, self._cov = np.eye(4), np.zeros((6, 6))
 
 
-_EARLIER_STEPS = 3, 7, 13  # keyframes back, to which a keyframe's pose is sent beside that to its reference
+_EARLIER_STEPS = 3, 7, 13  # keyframes back; a pose relative to each is sent beside that to the reference
 
 
 def select_earlier(earlier: EarlierPoses, keyframe_id: int) -> EarlierPoses:
     """Return the poses relative to the keyframes nearest to `_EARLIER_STEPS` before this one.
 
-    A chain of steps between neighbours loses what the tracker knows of longer ones: its window."""
+    A chain of steps between neighbours loses what the tracker knows of longer motions in its window."""
     steps = keyframe_id - earlier.ids
     rows = sorted({int(np.abs(steps - step).argmin()) for step in _EARLIER_STEPS if (steps > 1).any()})
     rows = [row for row in rows if steps[row] > 1]

@@ -98,9 +98,6 @@ class ClientService:
         for map_event in map_events:
             self.on_map_event(map_event)
 
-    def begin_segment(self, run: str, keyframe: int) -> None:
-        self.maps.begin_segment(run, keyframe)
-
     def on_map_event(self, map_event: MapEvent) -> None:
         """Follow a decision of the mapper."""
         if map_event.joined is not None:
@@ -118,9 +115,6 @@ class ClientService:
     def _follow_joins(self) -> None:
         for move in self.maps.due_joins([run.key for run in self._runs.present()]):
             self._objects.follow(move)
-
-    def forget_run(self, run: str) -> None:
-        self.maps.forget(run)
 
     def mark_saved(self, ticket: int) -> None:
         self._objects.mark_saved(ticket)

@@ -240,7 +240,7 @@ class EdgeProtocol:
         run = (SaveRun(peer.key, peer.hello, peer.credential),) if peer.odometry_base is None else ()
         peer.odometry_base = OdometryBase.from_keyframe(keyframe, peer.odometry_base)
         if keyframe.reference < 0:
-            self.room.begin_segment(peer.key, keyframe.id)
+            self.room.maps.begin_segment(peer.key, keyframe.id)
         self._out.save(*run, SaveKeyframe(peer.key, keyframe))
         is_over_rate = self._quota.is_over_rate(peer.name, self._out.now_ns)
         self._out.add(ed.AddKeyframe(peer.key, keyframe, is_over_rate))

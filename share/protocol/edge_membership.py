@@ -65,7 +65,7 @@ class RoomMembership:
         self._session, self._registry, self._out = session, registry, out
         self._silent_s = config.edge.silent_s
         self._rate_scheduler, self._room, self._trackers = rate_scheduler, room, trackers
-        self._admission = Admission(config.edge, trackers.tracks_agents, rate_scheduler.objection)
+        self._admission = Admission(config.edge, trackers.tracks_agents, rate_scheduler)
 
     def on_hello(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> None:
         """Welcome a new or known run, or refuse it. No answer while the name's present run may be dead: the
@@ -84,7 +84,7 @@ class RoomMembership:
 
     def _make_room(self, peer: Peer) -> None:
         """Remove the robots that are displaced by a run that has joined."""
-        displaced = self._rate_scheduler.displaced(peer.name, peer.hello.kind, self._out.now_ns)
+        displaced = self._rate_scheduler.policy.displaced(peer.name, peer.hello.kind, self._out.now_ns)
         for other in self._registry.present() if displaced else ():
             if other.name in displaced:
                 self.refuse(other.id, f"no air left beside headsets: '{peer.name}' has joined")
@@ -118,10 +118,10 @@ class RoomMembership:
         self._out.add(*self._trackers.start(peer.key))
         if not self._trackers.is_ready(peer.key):
             return
-        peer.is_welcomed, hold_ms = True, self._rate_scheduler.hold_ms(peer.name, self._out.now_ns)
+        peer.is_welcomed, hold_ms = True, self._rate_scheduler.policy.hold_ms(peer.name, self._out.now_ns)
         self._out.send(peer.id, wire.Welcome(self._session, peer.durable_below, hold_ms))
         peer.grant = None
-        first = self._rate_scheduler.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
+        first = self._rate_scheduler.policy.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
         self.send_grant(peer, first)
         if peer.last_correction_event is not None:
             self._out.send_correction(peer, peer.last_correction_event, is_repeat=True)
@@ -181,7 +181,7 @@ class RoomMembership:
         if self._registry.forget(peer):  # it was the latest of its name
             self._rate_scheduler.forget(peer.name)
         self._out.add(ed.DropRun(peer.key))
-        self._room.forget_run(peer.key)
+        self._room.maps.forget(peer.key)
         self._trackers.remove(peer.key)
 
     def may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
@@ -206,6 +206,6 @@ class RoomMembership:
     def send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""
         if grant is not None and grant != peer.grant:
-            is_windowed = self._rate_scheduler.is_windowed
+            is_windowed = self._rate_scheduler.policy.is_windowed
             self._out.send(peer.id, wire.Rate(grant.hz, is_windowed, grant.pose_hz, grant.jpeg_quality))
             peer.grant = grant

@@ -13,7 +13,7 @@ from share.checks import MAX_ID
 from share.earlier_poses import EarlierPoses
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.mapping.agents.covariance_scales import inflate_span
+from share.mapping.graph.edges import inflate_span
 from share.timing import SECOND_NS, TokenBuckets
 from share.types import F64, I64, Keyframe
 from share.vision.keyframe_images import image_objection
@@ -269,15 +269,15 @@ class FairQueue(Generic[T]):
         return item
 
 
-# ---- Steps put together. Agents are compared by their steps; poses relative to earlier keyframes that say
-# something else, or are much surer, would bend the map unseen. Measured on 19 emulated paths
+# ---- Chains of steps. Agents are compared by their steps; poses relative to earlier keyframes that
+# contradict these, or are much more certain, would bend the map unnoticed. Measured on 19 emulated paths
 # (docs/lab/attack-figures.md): 99 % of the squared differences of correct agents are below 2.3 of the steps'
 # variance; with lengths 3 % off they are 14 to 72 in the mean. And of n steps no pose has less than some 1/n
 # of their variance, since the error of a keyframe occurs once in it and n times in the steps.
 
 _REACH = 64  # keyframes; SHARE's agents reach 13 back
 _MAX_CHI2 = 9.0  # of translation and rotation, 2 expected at most; beyond, the robust kernel discounts it too
-_LEAST_SHARE = 0.5  # of the mean variance of the steps in between
+_MIN_VARIANCE_SHARE = 0.5  # of the mean variance of the steps in between
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +334,7 @@ class StepChain:
     def _bounded(self, earlier: EarlierPoses, rows: I64) -> EarlierPoses:
         """Return poses relative to keyframes in these rows, with the least variance that the steps allow."""
         count = len(self.ids) - 1 - rows
-        least = _LEAST_SHARE * (self.variance[-1] - self.variance[rows]) / count[:, None]
+        least = _MIN_VARIANCE_SHARE * (self.variance[-1] - self.variance[rows]) / count[:, None]
         missing = np.maximum(0.0, least - _variance(earlier.cov))
         if not missing.any():
             return earlier

@@ -14,7 +14,7 @@ from share.types import OdometryKeyframe
 from share.wire.messages import Rate
 
 RATE_BURST = 2.0  # keyframes that may be saved up under a rate limit
-_MIN_RATE_HZ = 0.1  # that an edge cannot undercut: without keyframes it could not evaluate again
+_MIN_RATE_HZ = 0.1  # whatever the edge asks for: without keyframes it could not evaluate again
 
 
 class KeyframePace:
@@ -47,13 +47,13 @@ class KeyframePace:
         """Hold keyframes, as a welcome asks for."""
         self._held_until_ns = now_ns + round(1e6 * hold_ms)
 
-    def next_send_ns(self, now_ns: int) -> int:
-        """Return when a keyframe of now is sent, at the earliest."""
-        return max(now_ns, self._held_until_ns)
+    def is_holding(self, now_ns: int) -> bool:
+        """Return whether keyframes are still held."""
+        return now_ns < self._held_until_ns
 
     def set_rate(self, rate: Rate, now_ns: int) -> None:
-        """Take what the edge asks for. Where nothing was limited, one keyframe goes at once: of twelve agents
-        that are limited at once, bursts would fill the air."""
+        """Apply a rate of the edge. The first one leaves at most one keyframe saved up: if twelve agents are
+        limited at once, their bursts would fill the air."""
         if self._bucket.hz is None:
             self._bucket.limit_saved(1.0)
         self._bucket.set_rate(max(rate.hz, _MIN_RATE_HZ), now_ns)

@@ -1,8 +1,8 @@
-"""Which maps there are, and how the frames of those that were joined lie to each other, as agents see them.
+"""Which maps there are, and the transforms between the frames of joined maps, as agents see them.
 
-Agents are shown a map by corrections, with `T_map_odom`. A correction that takes an agent from one map into
-another within one segment of its odometry says where the old frame is in the new one: what stays in place
-for this agent stays where the room is.
+Agents get `T_map_odom` by corrections. Where a correction takes an agent from one map into another within a
+segment of its odometry, the two T_map_odom give the transform between the maps: what stays in place for this
+agent stays where the room is.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class KnownMaps:
         return map_id in self.ids()
 
     def ids(self) -> frozenset[str]:
-        """Return the maps that a run was last shown, and those of the newest solution."""
+        """Return the maps of the runs' newest corrections, and those of the newest solution."""
         return self._solved | {correction.map_id for correction in self._corrections.values()}
 
     def add_solved(self, map_ids: Collection[str]) -> None:

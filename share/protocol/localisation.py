@@ -28,11 +28,11 @@ _MAX_FRAME_S = 0.1  # a frame after a gap moves the pose no further than one aft
 
 
 class MapFrame:
-    """T_map_odom (4, 4) in force, which follows the corrections without visible steps.
+    """The present T_map_odom (4, 4), which follows the corrections without visible steps.
 
-    What is left of a correction is taken about the body, and decays with a time constant at a limited speed.
-    A newer correction changes where it goes, never the pose in force. A correction into another map, or by a
-    long way, applies at once: the pose jumps.
+    The remaining correction, a motion of the body, decays with a time constant, at a limited speed. A newer
+    correction changes the target, never the present pose. A correction into another map, or by a long way,
+    applies at once: the pose jumps.
     """
 
     def __init__(self, time_constant_s: float) -> None:
@@ -67,7 +67,7 @@ class MapFrame:
 
     @property
     def T_map_odom(self) -> F64 | None:
-        """The transform (4, 4) in force; None before the first correction."""
+        """The present transform (4, 4); None before the first correction."""
         return self._current
 
     def sigma_cm(self, T_odom_body: F64) -> float:
@@ -189,7 +189,7 @@ class SelfEvaluation:
         self._processing_ms: float | None = None  # average
 
     def add_processing_time(self, ms: float) -> None:
-        """Add the time from a frame's arrival to its candidate, ms."""
+        """Add the time from a frame's arrival to its keyframe candidate, ms."""
         self._processing_ms = exponential_average(self._processing_ms, ms)
 
     def add_keyframe(self, keyframe: Keyframe, frame: ev.FrameTracked) -> None:

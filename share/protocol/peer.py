@@ -159,9 +159,7 @@ class Peer(Sender):
     computation: ComputationDelay = field(default_factory=ComputationDelay)
     credential: str | None = ""
     since_last_ns: int = 0  # from the message before the newest until that; 0: there was none
-    arrival_ms: float = (
-        0.0  # the same of the newest keyframe that is new: how long it took to arrive, at most
-    )
+    arrival_ms: float = 0.0  # `since_last_ns` of its newest keyframe: how long that took to arrive, at most
 
     @property
     def map_id(self) -> str | None:

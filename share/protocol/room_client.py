@@ -1,7 +1,7 @@
-"""A client of the edge as a state machine: who sends a robot, places objects, or drives a robot.
+"""A client of the edge as a state machine: it commands robots, places objects, or drives a robot.
 
 `RoomClient.handle` takes one event and the time and returns effects. Requests are repeated until they are
-answered; a goal is repeated until it is final, and its robot stops where that ends.
+answered. A goal is repeated until it is final; if the repetition ends before, its robot stops.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RoomClient:
     def __init__(self, hello: room.ClientHello, silent_s: float, keeps_trying: bool = False) -> None:
         self._hello, self._keeps_trying = hello, keeps_trying
         self._connection = EdgeConnection(hello, silent_s, "it goes on trying")
-        self._mirror = ObjectReplica()
+        self._replica = ObjectReplica()
         self._ping_timer, self._sequence = PeriodicTimer(_PING_S), 0
         self._pings: deque[m.Ping] = deque(maxlen=_MAX_PINGS)
         self._requests: dict[int, _OpenRequest] = {}
@@ -71,12 +71,12 @@ class RoomClient:
     @property
     def objects(self) -> dict[int, room.RoomObject]:
         """The objects of the room, by id, as far as they have come."""
-        return self._mirror.objects
+        return self._replica.objects
 
     @property
     def has_all_objects(self) -> bool:
         """Whether a list of all objects has come, and all that it names."""
-        return self._mirror.is_complete
+        return self._replica.is_complete
 
     @property
     def is_idle(self) -> bool:
@@ -150,7 +150,7 @@ class RoomClient:
         is_restart = self._connection.sessions.session is not None
         match self._connection.welcome(welcome):
             case WelcomeOutcome.NEW_SESSION:
-                self._mirror.begin_session(welcome.session)
+                self._replica.begin_session(welcome.session)
                 self._hasten()
                 self._print("the edge has restarted" if is_restart else "connected to the edge")
             case WelcomeOutcome.RECONNECTED:
@@ -209,11 +209,11 @@ class RoomClient:
 
     def _on_objects(self, message: room.RoomObject | room.ObjectList) -> None:
         if isinstance(message, room.RoomObject):
-            changed = self._mirror.add(message)
+            changed = self._replica.add(message)
             self._effects += [] if changed is None else [ev.ObjectChanged(changed)]
             return
-        self._effects += [ev.ObjectChanged(gone) for gone in self._mirror.check(message)]
-        if (seen := self._mirror.seen()) is not None:
+        self._effects += [ev.ObjectChanged(gone) for gone in self._replica.check(message)]
+        if (seen := self._replica.seen()) is not None:
             self._send(seen)
 
     # ------------------------------------------------------------ commands

@@ -1,6 +1,6 @@
 """The objects of a room: what is where, in which map, since which revision.
 
-Every change has the room's next revision, so what somebody lacks is what is newer than what it has seen.
+Every change has the room's next revision, so a client lacks what is newer than what it has seen.
 Removed objects stay in the list for a while, with the reason.
 """
 

@@ -187,7 +187,7 @@ class StreamingAgent(AgentProtocol):
             self._effects.append(ev.FrameTrackedRemotely(frame, message.is_consistent))
             self._on_frame_tracked(frame)
 
-    def _restart(self, pending: int) -> str:
+    def _on_edge_restart(self, pending: int) -> str:
         self._streamer.reset()
         return "tracking starts again"
 

@@ -219,13 +219,13 @@ class SharePolicy(Policy):
     def evaluate(self, agent: str, report: AgentReport) -> RateGrant | None:
         evaluation = report.evaluation
         hz = self.rate(agent, report.kind, evaluation.delay_ms, evaluation.error_cm, report.now_ns)
-        terms = self._qoe_parameters(agent, report.kind)
-        # a ping waits for the air as well: of the round trip only what is there without others is not air
+        parameters = self._qoe_parameters(agent, report.kind)
+        # a ping waits for the air as well: only the base of the round trip is not air
         trip = self._base_trips.get(agent, BaseDelay()).with_delay(evaluation.rtt_ms, report.now_ns)
         self._base_trips[agent] = trip
         air_ms = max(0.0, evaluation.ack_ms - trip.ms - report.held_ms)
         air = AirtimeMeasurement(air_ms, report.arrival_ms, report.keyframes, report.poses)
-        return self._room.grant(agent, terms, hz, evaluation, air, report.now_ns, report.is_placed)
+        return self._room.grant(agent, parameters, hz, evaluation, air, report.now_ns, report.is_placed)
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int

@@ -32,38 +32,21 @@ class RateScheduler:
     """A policy and the history of its decisions, for one edge. Agents go by name; a new run starts anew."""
 
     def __init__(self, config: ControlConfig, policy: str) -> None:
-        self._config, self._policy = config, POLICIES[policy](config)
-        self.max_rate_hz = config.rate_max_hz if self._policy.limits_rate else None  # None: no limit
-        self.is_windowed = self._policy.is_windowed
+        self._config, self.policy = config, POLICIES[policy](config)
+        self.max_rate_hz = config.rate_max_hz if self.policy.limits_rate else None  # None: no limit
         self._is_full = False
         self._history: dict[str, RingBuffer] = {}  # of all runs of a name
         self._latest: dict[str, RatedEvaluation] = {}  # of the present run
 
     def begin_run(self, agent: str) -> None:
         """Start a new run of an agent, without a limit until its first evaluation."""
-        self._policy.forget(agent)
+        self.policy.forget(agent)
         self._latest.pop(agent, None)
 
     def forget(self, agent: str) -> None:
         """Drop all state and history of a name."""
         self.begin_run(agent)
         self._history.pop(agent, None)
-
-    def first_grant(self, agent: str, kind: AgentKind, now_ns: int) -> RateGrant | None:
-        """Return what an agent that joins may send; None: everything."""
-        return self._policy.first_grant(agent, kind, now_ns)
-
-    def hold_ms(self, agent: str, now_ns: int) -> float:
-        """Return how long an agent that joins now holds its keyframes, ms."""
-        return self._policy.hold_ms(agent, now_ns)
-
-    def objection(self, agent: str, kind: AgentKind, now_ns: int) -> str | None:
-        """Return why the room cannot serve one more agent, for a person; None if it can."""
-        return self._policy.objection(agent, kind, now_ns)
-
-    def displaced(self, agent: str, kind: AgentKind, now_ns: int) -> tuple[str, ...]:
-        """Return the names of the robots to remove so that a joining agent can be served."""
-        return self._policy.displaced(agent, kind, now_ns)
 
     def capacity_change(self, now_ns: int) -> str | None:
         """Return a line if the room has become full, or has capacity again; None if unchanged."""
@@ -72,13 +55,13 @@ class RateScheduler:
 
     def full_reason(self, now_ns: int) -> str | None:
         """Return why nobody, or no robot, can join now, for a person; None if all can."""
-        reasons = (self._policy.objection("", kind, now_ns) for kind in AgentKind)
+        reasons = (self.policy.objection("", kind, now_ns) for kind in AgentKind)
         return next(filter(None, reasons), None)
 
     def evaluate(self, agent: str, report: AgentReport, comp_ms: float, t_s: float) -> RateGrant | None:
         """Return what the agent may send from now on; None: everything. comp_ms: the edge's part of its
         delay. t_s: time for the report."""
-        grant, evaluation = self._policy.evaluate(agent, report), report.evaluation
+        grant, evaluation = self.policy.evaluate(agent, report), report.evaluation
         delay_ms, error_cm, track_ms = evaluation.delay_ms, evaluation.error_cm, evaluation.track_ms
         value = qoe(delay_ms, error_cm, QoeParameters.from_config(self._config, report.kind, agent))
         comm_ms = max(0.0, delay_ms - track_ms - comp_ms)

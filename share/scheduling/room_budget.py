@@ -33,29 +33,27 @@ from typing import TypeVar
 import numpy as np
 
 from share.scheduling.qoe import QoeParameters, QoeTable
-from share.scheduling.rate_allocation import MAX_LOAD, AirDemand, allocate_rates, most_load
+from share.scheduling.rate_allocation import MAX_LOAD, AirDemand, allocate_rates, load_of_wait
 from share.types import F64, AgentKind
 
-LEAST_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
+MIN_HZ = {AgentKind.AR: 0.5, AgentKind.ROBOT: 0.2}  # by form: enough to stay placed; robots yield first
 JOINING_HZ = 1.0  # Hz, of an agent that is alone in its map
 SLOW_START_HZ = 2.0  # Hz, of an agent that sends its first keyframes
 FREE_WAIT_MS = 5.0  # a quarter of the delay that a wearer notices
 SLOW_KEYFRAME_MS = 10.0  # on the air: half of what a wearer notices
 SMALL_JPEG_QUALITY = 20  # of small pictures; those that agents make have 50
 SMALL_SIZE = 0.57  # of a keyframe with a small picture, beside one with a full one (110 recordings)
-SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # what draws them interpolates
+SCARCE_POSE_HZ = {AgentKind.AR: 5.0, AgentKind.ROBOT: 2.0}  # viewers interpolate
 _WEIGHT = {AgentKind.AR: 1.0, AgentKind.ROBOT: 0.25}  # of an agent's QoE, by form
 # air of a small message: turn, preamble and acknowledgement, and its bytes as a part of a full keyframe's
 _MESSAGE_S, _MESSAGE_PART = 3e-4, 0.008
-OTHER_HZ = (
-    8.0  # small messages of an agent, both ways, that are no poses: pings, status, evaluations, answers
-)
+OTHER_HZ = 8.0  # small messages of an agent, both ways, but poses: pings, status, evaluations, answers
 FULL_POSE_HZ = 30.0  # of an agent that sends one a frame
 _TIME_CONSTANT_S = 5.0  # of measured times and rates: with 2 s rates swing where the air is just short
-_MOST_RISE = 4.0  # of a measured time in one report: more is the edge's doing or the agent's, not the air's
-_LEAST_AIR_S = 1e-3
-_AT_ONCE_S = 4e-3  # of air that a transmission of Wi-Fi takes at most: what is in one arrives at once
-_MOST_OTHER_DELAY_MS = 200.0  # that others count for: what one claims beyond is its own
+_MAX_RISE = 4.0  # of a measured time in one report: a larger one is not caused by the air
+_MIN_AIRTIME_S = 1e-3
+_AT_ONCE_S = 4e-3  # longest transmission of Wi-Fi: what is in one arrives at once
+_MAX_OTHER_DELAY_MS = 200.0  # of the median that counts as the least of any agent
 Seconds = TypeVar("Seconds", float, F64)
 SILENT_S = 3.0  # an agent that has not reported for so long takes no air
 
@@ -68,7 +66,7 @@ class AgentDemand:
     keyframes, pose_hz: of poses. Times, rates, size are filtered. is_placed: it shares a map with somebody,
     or nobody is there. size: s, of its keyframes, beside ones with full pictures."""
 
-    terms: QoeParameters
+    qoe: QoeParameters
     wanted_hz: float
     keyframe_s: float
     arrival_s: float
@@ -87,7 +85,7 @@ class AgentDemand:
         return self.arrival_s + _AT_ONCE_S
 
     @property
-    def claim_ratio(self) -> float:
+    def reported_ratio(self) -> float:
         """Ratio of the reported to the observed time; no keyframe is acknowledged before it has arrived."""
         return max(self.keyframe_s, self.arrival_s) / self.observed_s
 
@@ -97,9 +95,9 @@ class AgentDemand:
         return self.pose_hz + OTHER_HZ
 
     @property
-    def least_hz(self) -> float:
-        least_hz = LEAST_HZ[self.terms.form] if self.is_placed else JOINING_HZ
-        return min(least_hz, self.wanted_hz)
+    def min_hz(self) -> float:
+        min_hz = MIN_HZ[self.qoe.form] if self.is_placed else JOINING_HZ
+        return min(min_hz, self.wanted_hz)
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ class RoomBudget:
             elapsed_s = max(0.0, (now_ns - before.updated_ns) / 1e9)
             weight = -math.expm1(-elapsed_s / _TIME_CONSTANT_S)
             most = {
-                key: _MOST_RISE * max(getattr(before, key), _LEAST_AIR_S)
+                key: _MAX_RISE * max(getattr(before, key), _MIN_AIRTIME_S)
                 for key in ("keyframe_s", "arrival_s")
             }
             filtered = {
@@ -155,7 +153,7 @@ class RoomBudget:
 
     def _keyframe_time_s(self, agent: AgentDemand) -> float:
         """Return the scaled A of an agent, s."""
-        return self._median_claim_ratio * agent.observed_s
+        return self._median_reported_ratio * agent.observed_s
 
     @property
     def load(self) -> float:
@@ -174,11 +172,11 @@ class RoomBudget:
         return max(1 - MAX_LOAD, 1 - _MESSAGE_S * sum(a.messages_hz for a in self.agents.values()))
 
     @cached_property
-    def _median_claim_ratio(self) -> float:
-        """Median of `claim_ratio`, of agents whose keyframes take longer than one transmission."""
+    def _median_reported_ratio(self) -> float:
+        """Median of `reported_ratio`, of agents whose keyframes take longer than one transmission."""
         agents = self.agents.values()
         telling = [agent for agent in agents if agent.arrival_s >= _AT_ONCE_S] or agents
-        return _low_median([agent.claim_ratio for agent in telling]) or 0.0
+        return _low_median([agent.reported_ratio for agent in telling]) or 0.0
 
     @cached_property
     def median_airtime_s(self) -> float | None:
@@ -191,10 +189,10 @@ class RoomBudget:
         agents = list(self.agents.values())
         other_ms = [max(0.0, agent.delay_ms - 1e3 * self._keyframe_time_s(agent)) for agent in agents]
         median_ms = dict[AgentKind, float]()
-        for form in {agent.terms.form for agent in agents}:
-            of_form = [ms for agent, ms in zip(agents, other_ms, strict=True) if agent.terms.form is form]
+        for form in {agent.qoe.form for agent in agents}:
+            of_form = [ms for agent, ms in zip(agents, other_ms, strict=True) if agent.qoe.form is form]
             median_ms[form] = median(of_form) if len(of_form) > 2 else max(of_form)
-        least_ms = [min(_MOST_OTHER_DELAY_MS, median_ms[agent.terms.form]) for agent in agents]
+        least_ms = [min(_MAX_OTHER_DELAY_MS, median_ms[agent.qoe.form]) for agent in agents]
         return np.maximum(other_ms, least_ms)
 
     def is_short(self, wait_ms: float = FREE_WAIT_MS) -> bool:
@@ -213,7 +211,7 @@ class RoomBudget:
         messages_hz, load = FULL_POSE_HZ + OTHER_HZ, 0.0
         for agent, (airtime_s, size) in zip(self.agents.values(), keyframes, strict=True):
             load += agent.wanted_hz * airtime_s + messages_hz * message_s(airtime_s, size)
-        return load > most_load(_low_median([one for one, _ in keyframes]) or 0.0, wait_ms)
+        return load > load_of_wait(_low_median([one for one, _ in keyframes]) or 0.0, wait_ms)
 
     def allocate(
         self, waits_ms: Sequence[float] = (FREE_WAIT_MS,), before: Mapping[str, RateGrant] | None = None
@@ -221,7 +219,7 @@ class RoomBudget:
         """Return what every agent may send where the air is short, for each of these waits, which rise.
         before: what they have, which changes hands only for a much larger gain."""
         allocated = allocate_rates(self._demand(before or {}), waits_ms)
-        forms = [(name, agent.terms.form) for name, agent in self.agents.items()]
+        forms = [(name, agent.qoe.form) for name, agent in self.agents.items()]
         return [
             {name: scarce_grant(form, hz) for (name, form), hz in zip(forms, rates.tolist(), strict=True)}
             for rates in allocated
@@ -230,18 +228,18 @@ class RoomBudget:
     def _demand(self, before: Mapping[str, RateGrant]) -> AirDemand:
         """Return what all want where poses are thinned, in the order of `agents`."""
         agents = list(self.agents.values())
-        forms = [agent.terms.form for agent in agents]
+        forms = [agent.qoe.form for agent in agents]
         airtime_s = np.array([self.airtime_s(agent) for agent in agents])
         sizes = np.array([agent.size for agent in agents])
         pose_hz = np.array([SCARCE_POSE_HZ[form] for form in forms])
         error_cm = np.array([math.nan if a.error_cm is None else a.error_cm for a in agents])
         return AirDemand(
-            terms=QoeTable.of([agent.terms for agent in agents]),
+            qoe=QoeTable.of([agent.qoe for agent in agents]),
             airtime_s=airtime_s,
             median_airtime_s=self.median_airtime_s or 0.0,
             message_load=float((pose_hz + OTHER_HZ) @ message_s(airtime_s, sizes)),
             weight=np.array([_WEIGHT[form] for form in forms]),
-            least_hz=np.array([agent.least_hz for agent in agents]),
+            min_hz=np.array([agent.min_hz for agent in agents]),
             wanted_hz=np.array([agent.wanted_hz for agent in agents]),
             held_hz=np.array([before[name].hz if name in before else 0.0 for name in self.agents]),
             other_delay_ms=self.other_delays_ms(),
@@ -262,14 +260,14 @@ def message_s(keyframe_s: Seconds, size: Seconds | float = 1.0) -> Seconds:
     return _MESSAGE_S + _MESSAGE_PART * keyframe_s / size
 
 
-def least_load(form: AgentKind, keyframe_s: float) -> float:
+def min_load(form: AgentKind, keyframe_s: float) -> float:
     """Return the load of an agent that sends as little as it may, keyframes with small pictures."""
-    return LEAST_HZ[form] * keyframe_s + (SCARCE_POSE_HZ[form] + OTHER_HZ) * message_s(keyframe_s, SMALL_SIZE)
+    return MIN_HZ[form] * keyframe_s + (SCARCE_POSE_HZ[form] + OTHER_HZ) * message_s(keyframe_s, SMALL_SIZE)
 
 
 def first_grant(form: AgentKind, hz: float = SLOW_START_HZ) -> RateGrant:
     """Return what an agent may send until its air is known, if there are `hz` for it."""
-    return scarce_grant(form, min(SLOW_START_HZ, max(LEAST_HZ[form], hz)))
+    return scarce_grant(form, min(SLOW_START_HZ, max(MIN_HZ[form], hz)))
 
 
 def scarce_grant(form: AgentKind, hz: float) -> RateGrant:

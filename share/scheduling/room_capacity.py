@@ -12,15 +12,15 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from share.scheduling.rate_allocation import MAX_LOAD
-from share.scheduling.room_budget import SMALL_SIZE, RoomBudget, least_load
+from share.scheduling.room_budget import SMALL_SIZE, RoomBudget, min_load
 from share.timing import seconds_to_ns
 from share.types import AgentKind
 
 TOLERATED_DELAY_MS = 200.0  # of a headset's corrections; more is shown as its trouble
 TOLERATED_AIR_MS = TOLERATED_DELAY_MS - 60.0  # the air's part: the rest is what they take on ample air
-_MIN_REPORTS = 2  # what one agent reports refuses nobody
-_MUCH_MS = 10_000.0
-_SETTLED_S = 10.0  # for so long the room must have been full: a pause of the edge or of the air is none
+_MIN_REPORTS = 2  # agents: the report of a single one refuses nobody
+_MAX_TOLD_MS = 10_000.0  # a longer time is not told in ms
+_SETTLED_S = 10.0  # for which the room must have been full: pauses of the edge or of the air do not count
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class RoomCapacity:
 
     def reassess(self, budget: RoomBudget, now_ns: int) -> RoomCapacity:
         """Return what the room can take now."""
-        robots = [name for name, one in budget.agents.items() if one.terms.form is AgentKind.ROBOT]
+        robots = [name for name, one in budget.agents.items() if one.qoe.form is AgentKind.ROBOT]
         has_headset = len(robots) < len(budget.agents)
         leaving = list[str]()
         headset_ms = crowded_air_ms(budget, AgentKind.AR)
@@ -46,7 +46,7 @@ class RoomCapacity:
         robot_ms = crowded_air_ms(budget, AgentKind.ROBOT) if has_headset else 0.0
         air_ms = {AgentKind.AR: headset_ms, AgentKind.ROBOT: robot_ms}
         if headset_ms > TOLERATED_AIR_MS:
-            leaving.clear()  # it would not be enough: they go for nobody
+            leaving.clear()  # it would not be enough
         full_since_ns = {
             form: self.full_since_ns.get(form, now_ns) for form, ms in air_ms.items() if ms > TOLERATED_AIR_MS
         }
@@ -59,7 +59,7 @@ class RoomCapacity:
             return None
         kind = "headset" if form is AgentKind.AR else "robot"
         ms = self.air_ms[form]
-        how_long = f"{ms:.0f} ms" if ms < _MUCH_MS else "seconds"
+        how_long = f"{ms:.0f} ms" if ms < _MAX_TOLD_MS else "seconds"
         return (
             f"no air for one more {kind}: a keyframe would take {how_long}, {TOLERATED_AIR_MS:.0f} ms at most"
         )
@@ -76,11 +76,11 @@ def crowded_air_ms(budget: RoomBudget, joining: AgentKind, leaving: Collection[s
     the air."""
     if len(budget.agents) < _MIN_REPORTS:
         return 0.0
-    staying = [agent.terms.form for name, agent in budget.agents.items() if name not in leaving]
+    staying = [agent.qoe.form for name, agent in budget.agents.items() if name not in leaving]
     airtime_s = _lower_quartile(
         SMALL_SIZE * budget.airtime_s(agent) / agent.size for agent in budget.agents.values()
     )
-    load = sum(least_load(form, airtime_s) for form in [joining, *staying])
+    load = sum(min_load(form, airtime_s) for form in [joining, *staying])
     return math.inf if load >= MAX_LOAD else 1e3 * airtime_s / (1 - load)
 
 

@@ -22,8 +22,8 @@ from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 UNKNOWN_KEYFRAME_S = 0.03  # default before any measurement: a small picture, 12 kB, at 5 Mbit/s
-MAX_HOLD_S = 2.0  # longer, and a keyframe is stale: rather on a full air
-_LEAST_SLOT_S = 0.002
+MAX_HOLD_S = 2.0  # after which a keyframe is stale, and is sent even if the air is full
+_MIN_SLOT_S = 0.002
 
 
 class StaggeredStart:
@@ -39,7 +39,7 @@ class StaggeredStart:
     def hold_ms(self, slot_s: float, now_ns: int) -> float:
         """Give an agent that begins its turn, and return how far off that is, ms. slot_s: until the next
         one's."""
-        slot_s = max(slot_s, _LEAST_SLOT_S)
+        slot_s = max(slot_s, _MIN_SLOT_S)
         turn_ns = min(max(now_ns, self._free_ns), now_ns + seconds_to_ns(MAX_HOLD_S))
         self._free_ns = turn_ns + seconds_to_ns(min(slot_s, MAX_HOLD_S))
         return 1e3 * (turn_ns - now_ns) / SECOND_NS
@@ -49,7 +49,7 @@ _PERIOD_NS = 500_000_000  # between two allocations
 _SLOW_START_KEYFRAMES = 2  # before, an agent's air is not known
 _STARTING_NS = 10_000_000_000  # after this time an agent without keyframes no longer reserves a share
 _STARTING_LOAD = 0.5  # of the air that is free, for all that begin
-_PLENTY = 0.75  # of the free wait: less, and the air is no longer short
+_HYSTERESIS = 0.75  # part of a limit below which the air is no longer short
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class RoomController:
     def grant(
         self,
         name: str,
-        terms: QoeParameters,
+        qoe: QoeParameters,
         wanted_hz: float,
         evaluation: Evaluation,
         air: AirtimeMeasurement,
@@ -107,7 +107,7 @@ class RoomController:
         """Return what an agent may send, by its evaluation. is_placed: see `AgentDemand`."""
         hz, pose_hz = self._rates(name, (air.keyframes, air.poses), now_ns)
         reported = AgentDemand(
-            terms=terms,
+            qoe=qoe,
             wanted_hz=wanted_hz,
             keyframe_s=air.keyframe_ms / 1e3,
             arrival_s=air.arrival_ms / 1e3,
@@ -121,12 +121,12 @@ class RoomController:
             size=self._grants[name].size if name in self._grants else SMALL_SIZE,
         )
         if not air.keyframes:  # no keyframe has arrived that would confirm its report
-            return self.first_grant(terms.form, now_ns)
+            return self.first_grant(qoe.form, now_ns)
         self._budget = self._budget.with_report(name, reported, self._last.get(name))
         self._last[name] = self._budget.agents[name]
         self._reassess_capacity(now_ns)
         if air.keyframes < _SLOW_START_KEYFRAMES:
-            return self.first_grant(terms.form, now_ns)
+            return self.first_grant(qoe.form, now_ns)
         self._starting.pop(name, None)
         if not self._is_short or name not in self._grants or now_ns - self._allocated_ns >= _PERIOD_NS:
             self._allocate(now_ns)
@@ -134,9 +134,12 @@ class RoomController:
 
     def _allocate(self, now_ns: int) -> None:
         """Allocate the airtime anew, with hysteresis: once scarce, the air counts as scarce until keyframes
-        wait for less than `_PLENTY` of the limit; a rate stays while it is between what both waits allow."""
-        budget, self._allocated_ns, plenty_ms = self._budget, now_ns, _PLENTY * FREE_WAIT_MS
-        self._has_small_pictures = budget.needs_small_pictures(_PLENTY if self._has_small_pictures else 1.0)
+        wait for less than `_HYSTERESIS` of the limit; a rate stays while it is between what both waits
+        allow."""
+        budget, self._allocated_ns, plenty_ms = self._budget, now_ns, _HYSTERESIS * FREE_WAIT_MS
+        self._has_small_pictures = budget.needs_small_pictures(
+            _HYSTERESIS if self._has_small_pictures else 1.0
+        )
         is_short = budget.is_short(plenty_ms if self._is_short else FREE_WAIT_MS)
         self._is_short = self._has_small_pictures and is_short
         if not self._is_short:

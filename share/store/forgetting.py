@@ -84,12 +84,12 @@ def _check_names(path: Path, kept: StoredMap, agents: Collection[str] | None) ->
 
 def _report(store: MapStore, kept: StoredMap, plan: ForgettingPlan) -> ForgettingReport:
     return ForgettingReport(
-        len(plan.keyframes),
-        _count_by_agent(kept, plan.keyframes),
+        len(plan.removed),
+        _count_by_agent(kept, plan.removed),
         len(kept.loops) - plan.loops,
-        store.image_bytes(stored.keyframe_key for stored in plan.keyframes),
-        len(plan.left),
-        _count_by_agent(kept, plan.left),
+        store.image_bytes(stored.keyframe_key for stored in plan.removed),
+        len(plan.remaining),
+        _count_by_agent(kept, plan.remaining),
         plan.loops,
         dict(Counter(plan.poses.map_ids)),
         len({name for name, _ in map_poses(kept).values()}),

@@ -199,7 +199,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     poses, lost_poses = _decode_rows(read_rows, "poses", rows.read_poses)
     arrivals = dict(_decode_rows(read_rows, "arrival", rows.read_arrival)[0])
     repaired = repair_references(
-        [replace(k, came_s=arrivals.get(k.keyframe_key)) for k in keyframes if k.run_key in runs],
+        [replace(k, arrived_s=arrivals.get(k.keyframe_key)) for k in keyframes if k.run_key in runs],
         {link.key: link for link in links},
     )
     known_keys = {k.keyframe_key for k in repaired.keyframes}

@@ -11,7 +11,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, U8
+from share.types import F32, F64, U8, Frame
 from share.vision import optical_flow
 from share.vision.patches import sample_square
 
@@ -19,6 +19,23 @@ EDGE_RATIO = 0.05  # relative depth step within 3 x 3 px at an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
 MIN_RHO = 0.03  # 1/m; the depth of what is further away is unknown
 _DEFAULT_DEPTH_M = 3.0  # initial guess
+
+
+def measures_depth(frame: Frame, rig: Rig) -> bool:
+    """Return whether stereo or a depth camera measures depth."""
+    return (frame.depth is not None and rig.depth is not None) or (
+        frame.image1 is not None and rig.cam1 is not None
+    )
+
+
+def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64) -> F64:
+    """Return the depth (N,) m in cam0 of image points, from stereo or a depth camera; NaN where
+    unknown."""
+    if frame.depth is not None and rig.depth is not None:
+        return from_depth_camera(frame.depth, rig, uv)
+    if frame.image1 is not None and rig.cam1 is not None:
+        return from_stereo(frame.image0, frame.image1, rig, px, uv)
+    return np.full(len(px), np.nan)
 
 
 def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:

@@ -1,33 +1,16 @@
-"""ORB features spread over the image, and the depth that a frame measures."""
+"""ORB features spread over the image, with the depths of known surfaces."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from share.geometry.camera import Camera, Rig, rays
-from share.types import DESCRIPTOR_BYTES, F32, F64, U8, Frame, KeyframeImage, View
-from share.vision import depth as depths
+from share.geometry.camera import Camera, rays
+from share.types import DESCRIPTOR_BYTES, F32, F64, U8, KeyframeImage, View
 from share.vision.corners import GRID, UNIFORM_FIELD_DEG, field_mask, spread_order
+from share.vision.depth import MIN_RHO
 
 _SURFACE_PX = 60.0  # a feature at most this far from one of the tracker lies on that one's surface
-
-
-def measures_depth(frame: Frame, rig: Rig) -> bool:
-    """Return whether stereo or a depth camera measures depth."""
-    return (frame.depth is not None and rig.depth is not None) or (
-        frame.image1 is not None and rig.cam1 is not None
-    )
-
-
-def measure_depth(frame: Frame, rig: Rig, px: F32, uv: F64) -> F64:
-    """Return the depth (N,) m in cam0 of image points, from stereo or a depth camera; NaN where
-    unknown."""
-    if frame.depth is not None and rig.depth is not None:
-        return depths.from_depth_camera(frame.depth, rig, uv)
-    if frame.image1 is not None and rig.cam1 is not None:
-        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv)
-    return np.full(len(px), np.nan)
 
 
 def image_view(image: U8, camera: Camera, features: KeyframeImage, count: int) -> View:
@@ -51,7 +34,7 @@ def _surface_rho(px: F32, uv: F64, camera: Camera, surfaces: KeyframeImage) -> F
     nearest = squared_px.argmin(axis=1)
     rho = (rays(uv) * surfaces.plane[nearest]).sum(axis=1)
     is_near = squared_px.min(axis=1) < _SURFACE_PX**2
-    out: F64 = np.where(is_near & (rho > depths.MIN_RHO), rho, np.nan)
+    out: F64 = np.where(is_near & (rho > MIN_RHO), rho, np.nan)
     return out
 
 

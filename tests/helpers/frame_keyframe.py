@@ -7,8 +7,8 @@ import numpy as np
 from share.geometry.camera import Rig
 from share.types import Frame, KeyframeImage
 from share.vision import corners
+from share.vision.depth import measure_depth
 from share.vision.keyframe_images import Surfaces
-from share.vision.orb import measure_depth
 
 _SPACING_PX = 10
 _RHO_SIGMA = 0.01  # 1/m, of an inverse depth

@@ -15,13 +15,13 @@ from share.odometry import state as filter_state
 from share.odometry.imu_predictor import ImuBuffer
 from share.odometry.imu_propagation import noise_with_vibration
 from share.odometry.initial_depth import prior_from_neighbours
-from share.odometry.landmarks import LASTING_PX
+from share.odometry.landmarks import CORRELATED_SIGMA_PX
 from share.odometry.state import CORE_SIZE, POSE, FilterState, initial_state
 from share.types import ImuBatch
 
 FRAME_HZ = 20
 SHIPPED = InertialConfig()
-LASTING_S = 1.0  # of a Gauss-Markov process with `LASTING_PX` of the world's
+LASTING_S = 1.0  # of a Gauss-Markov process with `CORRELATED_SIGMA_PX` of the world's
 
 
 @dataclass
@@ -169,7 +169,7 @@ class _World:
         inside = ~np.isnan([px[:, 0] for px in seen]).any(axis=0)
         which = np.flatnonzero(inside)
         sigma = np.full(len(which), self._sigma_px / CAMERA.focal)
-        lasts = np.full(len(which), LASTING_PX / CAMERA.focal)
+        lasts = np.full(len(which), CORRELATED_SIGMA_PX / CAMERA.focal)
         first, *others = (
             filter.feature_measurements(
                 state,
@@ -196,7 +196,7 @@ class _World:
     def _what_lasts(self, ids):
         """px (N, 2), a frame later."""
         kept = np.exp(-1 / FRAME_HZ / LASTING_S)
-        fresh = self._rng.normal(0, LASTING_PX * np.sqrt(1 - kept**2), (len(ids), 2))
+        fresh = self._rng.normal(0, CORRELATED_SIGMA_PX * np.sqrt(1 - kept**2), (len(ids), 2))
         for i, news in zip(ids.tolist(), fresh, strict=True):
             self._lasting[i] = kept * self._lasting.get(i, np.zeros(2)) + news
         return np.array([self._lasting[i] for i in ids.tolist()])

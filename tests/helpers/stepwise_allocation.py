@@ -20,11 +20,11 @@ class StepwiseAllocation:
         self._airtime_s = {name: budget.airtime_s(one) for name, one in budget.agents.items()}
         other_ms = budget.other_delays_ms().tolist()
         self._other_delay_ms = dict(zip(budget.agents, other_ms, strict=True))
-        forms = {one.terms.form for one in self._agents.values()}
+        forms = {one.qoe.form for one in self._agents.values()}
         self._first_form = AgentKind.AR if AgentKind.AR in forms else AgentKind.ROBOT
 
     def rates(self, wait_ms: float) -> dict[str, float]:
-        hz = {name: one.least_hz for name, one in self._agents.items()}
+        hz = {name: one.min_hz for name, one in self._agents.items()}
         while (load := self._load(hz)) < MAX_LOAD:
             is_open = [n for n, one in self._agents.items() if hz[n] + STEP_HZ <= one.wanted_hz]
             free = [n for n in is_open if not self._waits(load + STEP_HZ * self._airtime_s[n], wait_ms)]
@@ -41,7 +41,7 @@ class StepwiseAllocation:
         return hz
 
     def _is_first(self, name: str) -> bool:
-        return self._agents[name].terms.form is self._first_form
+        return self._agents[name].qoe.form is self._first_form
 
     def _is_joining(self, name: str, load: float) -> bool:
         """Whether an agent that shares a map with nobody gets one more step."""
@@ -49,7 +49,7 @@ class StepwiseAllocation:
 
     def _load(self, hz: dict[str, float]) -> float:
         messages = sum(
-            (SCARCE_POSE_HZ[one.terms.form] + OTHER_HZ) * message_s(self._airtime_s[n], one.size)
+            (SCARCE_POSE_HZ[one.qoe.form] + OTHER_HZ) * message_s(self._airtime_s[n], one.size)
             for n, one in self._agents.items()
         )
         return min(MAX_LOAD, messages + sum(hz[n] * self._airtime_s[n] for n in hz))
@@ -71,7 +71,7 @@ class StepwiseAllocation:
         """Return an agent's QoE, weighted, by its rate and the load of the air."""
         one = self._agents[name]
         delay_ms = self._other_delay_ms[name] + 1e3 * self._airtime_s[name] / (1 - load)
-        return WEIGHT[one.terms.form] * qoe(delay_ms, _error_cm(one, hz), one.terms)
+        return WEIGHT[one.qoe.form] * qoe(delay_ms, _error_cm(one, hz), one.qoe)
 
 
 def _error_cm(one: AgentDemand, hz: float) -> float | None:

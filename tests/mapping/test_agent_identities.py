@@ -250,7 +250,7 @@ def test_any_number_of_removed_runs_leaves_only_the_suspicion():
         atlas.remove_run("eve-next")
         assert not agreement.pairs
         assert not agreement.disputed
-        assert agreement.covariance_scales.claims.known_agents == {"ann"}
+        assert agreement.covariance_scales.stated.known_agents == {"ann"}
         assert atlas.quarantine.agreement.standing("ann").state == "unknown"
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from share.mapping import query_queue
-from share.mapping.query_queue import CandidateSearch
+from share.mapping import candidates
+from share.mapping.candidates import CandidateSearch
 
 
 def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[int]:
@@ -21,7 +21,7 @@ def tried(search: CandidateSearch, hurries: list[bool], hits: set[int]) -> list[
 
 @pytest.fixture(autouse=True)
 def two_in_a_hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(query_queue, "MAX_BACKLOG_CANDIDATES", 2)
+    monkeypatch.setattr(candidates, "MAX_BACKLOG_CANDIDATES", 2)
 
 
 def search() -> CandidateSearch:

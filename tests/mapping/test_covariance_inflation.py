@@ -12,9 +12,8 @@ from helpers.atlas_sim import STEP, UP, UP_SIGMA, Walker, near_loops
 from share.config import MergeConfig
 from share.geometry import se3
 from share.mapping.agents.agreement import AgentAgreement
-from share.mapping.agents.covariance_scales import inflate_covariance
 from share.mapping.atlas import Atlas
-from share.mapping.graph.edges import PoseEdge
+from share.mapping.graph.edges import PoseEdge, inflate_covariance
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import StoredKeyframe, StoredMap
 from share.mapping.recognition.depth_scale import DepthScale, relative_depth_scale

@@ -10,7 +10,7 @@ from test_agent_consistency import FRAMES, LOOP_COV, STEP_COV, chain, ring, step
 
 from share.geometry import se3
 from share.mapping.agents.agreement import AgentAgreement
-from share.mapping.agents.covariance_scales import CovarianceClaims, CovarianceScales
+from share.mapping.agents.covariance_scales import CovarianceScales, StatedCovariances
 from share.mapping.agents.pairwise import (
     InterAgentLoop,
     comparison_equations,
@@ -32,8 +32,8 @@ def walkers(seed: int, sure: float, rounds: int = 8) -> CovarianceScales:
         paths[name] = ring(phase)
         scale = DRIFT**2 / (sure**2 if name == "eve" else 1.0)
         walked[name] = chain(steps_of(paths[name], rng, drift=DRIFT), scale)
-    claims = claims_of({name: 1 / sure if name == "eve" else 1.0 for name in WALKERS})
-    covariance_scales, evidence = CovarianceScales(claims), {}
+    stated = stated_by({name: 1 / sure if name == "eve" else 1.0 for name in WALKERS})
+    covariance_scales, evidence = CovarianceScales(stated), {}
     for n, (a, b) in enumerate((("ann", "bob"), ("ann", "eve"), ("bob", "eve"))):
         loops = []
         for j in range(4, FRAMES, 2):
@@ -79,47 +79,47 @@ def test_few_loops_change_no_scale():
     assert covariance_scales.scales == {}
 
 
-def claims_of(sigmas: dict[str, float]) -> CovarianceClaims:
-    claims = CovarianceClaims()
+def stated_by(sigmas: dict[str, float]) -> StatedCovariances:
+    stated = StatedCovariances()
     for name, sigma in sigmas.items():
         for _ in range(10):
-            claims.add_step(name, MOVED, sigma**2 * STEP_COV)
+            stated.add_step(name, MOVED, sigma**2 * STEP_COV)
     for one, other in itertools.combinations(sigmas, 2):
-        claims.link(one, other)
-    return claims
+        stated.link(one, other)
+    return stated
 
 
 def test_agents_without_a_common_loop_are_not_compared():
     """With any variances."""
-    claims = claims_of({"ann": 1.0})
+    stated = stated_by({"ann": 1.0})
     for _ in range(10):
-        claims.add_step("eve", MOVED, 1e6 * STEP_COV)
-    assert claims.min_scale("ann") == 1.0
-    claims.link("ann", "eve")
-    assert claims.min_scale("ann") == 100.0
+        stated.add_step("eve", MOVED, 1e6 * STEP_COV)
+    assert stated.min_scale("ann") == 1.0
+    stated.link("ann", "eve")
+    assert stated.min_scale("ann") == 100.0
 
 
 def test_without_evidence_no_agent_counts_as_much_more_certain_than_the_others():
-    claims = claims_of({"ann": 1.0, "bob": 3.0, "eve": 0.1})
-    assert claims.min_scale("ann") == claims.min_scale("bob") == 1.0
-    assert claims.min_scale("eve") == pytest.approx(100 / 2.25)
-    claims.exclude(["ann"])
-    assert claims.min_scale("eve") == 100.0  # of 400
-    claims.exclude(["eve"])
-    assert claims.min_scale("ann") == pytest.approx(9 / 2.25)
-    assert claims.min_scale("eve") == pytest.approx(100 / 2.25)
-    claims.remove_agent("ann")
-    assert claims.min_scale("eve") == 100.0  # of 400
-    assert claims.known_agents == {"bob", "eve"}
+    stated = stated_by({"ann": 1.0, "bob": 3.0, "eve": 0.1})
+    assert stated.min_scale("ann") == stated.min_scale("bob") == 1.0
+    assert stated.min_scale("eve") == pytest.approx(100 / 2.25)
+    stated.exclude(["ann"])
+    assert stated.min_scale("eve") == 100.0  # of 400
+    stated.exclude(["eve"])
+    assert stated.min_scale("ann") == pytest.approx(9 / 2.25)
+    assert stated.min_scale("eve") == pytest.approx(100 / 2.25)
+    stated.remove_agent("ann")
+    assert stated.min_scale("eve") == 100.0  # of 400
+    assert stated.known_agents == {"bob", "eve"}
 
 
 def test_small_differences_of_stated_covariances_change_no_scale():
-    claims = claims_of({"ann": 1.0, "bob": 1.4, "eve": 0.7})
-    assert all(claims.min_scale(name) == 1.0 for name in ("ann", "bob", "eve"))
+    stated = stated_by({"ann": 1.0, "bob": 1.4, "eve": 0.7})
+    assert all(stated.min_scale(name) == 1.0 for name in ("ann", "bob", "eve"))
 
 
 def test_an_agent_alone_is_not_scaled():
-    assert claims_of({"eve": 0.01}).min_scale("eve") == 1.0
+    assert stated_by({"eve": 0.01}).min_scale("eve") == 1.0
 
 
 def test_scattered_depth_scales_have_a_larger_sigma():
@@ -170,7 +170,7 @@ def test_a_scale_near_its_threshold_does_not_toggle():
     """Its variances are 4.5 times below another's, twice the tolerance; steps differ in size."""
     rng, applied = np.random.default_rng(0), list[float]()
     covariance_scales = CovarianceScales()
-    covariance_scales.claims.link("ann", "bob")
+    covariance_scales.stated.link("ann", "bob")
     for _ in range(300):
         for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
             step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])

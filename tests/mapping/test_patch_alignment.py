@@ -99,7 +99,7 @@ def test_the_covariance_is_that_of_right_perturbations_of_the_bodies_pose(
         px = CAMERA.project(se3.transform(T, points))
         index = np.flatnonzero(CAMERA.is_inside(px, 6.0))
         px = px[index] + rng.normal(0, 0.2 * 2**level, (len(index), 2))
-        return patch_alignment._Alignment(index, px, len(index))
+        return patch_alignment._AlignedFeatures(index, px, len(index))
 
     monkeypatch.setattr(patch_alignment, "_align", aligned)
     for _ in range(trials):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig
-from share.odometry.health import WEAK
+from share.odometry.health import MIN_OK_FEATURES
 from share.odometry.landmarks import LandmarkMap
 from share.odometry.state import CORE_SIZE, initial_state
 from share.runtime.pipeline import read_frames
@@ -16,7 +16,7 @@ from share.sensors.sequencer import SequencerCounters
 pytestmark = pytest.mark.long
 
 CONFIG, STILL = InertialConfig(), np.zeros(3)
-ENOUGH = WEAK // 2
+ENOUGH = MIN_OK_FEATURES // 2
 
 
 @pytest.fixture(scope="module")

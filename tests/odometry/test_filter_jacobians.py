@@ -155,7 +155,7 @@ def test_a_state_that_is_moved_is_as_uncertain_about_its_body_as_before():
     )
     A = rng.normal(size=(CORE_SIZE, CORE_SIZE)) * 0.01
     s.cov[:CORE_SIZE, :CORE_SIZE] = A @ A.T
-    filter_state.begin_here(s)
+    filter_state.set_origin(s)
     there = copy.deepcopy(s)
     filter_state.move(there, se3.exp(np.array([0.02, -0.01, 2.5, 3.0, -4.0, 1.0])))
     on_the_right = [

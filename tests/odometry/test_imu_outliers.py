@@ -95,13 +95,13 @@ def test_rejected_samples_inflate_the_interval_of_their_frame() -> None:
     samples, values = ImuBuffer(), walking()
     values[104:108, 3] += 50.0
     samples.add(batch(values[:100]))
-    assert samples.inflation(0, 100 * STEP) is None
+    assert samples.outliers.inflation(0, 100 * STEP) is None
     samples.add(batch(values[100:110], 100))
-    inflation = samples.inflation(100 * STEP, 110 * STEP)
-    assert inflation is not None and samples.rejected_count == 4
+    inflation = samples.outliers.inflation(100 * STEP, 110 * STEP)
+    assert inflation is not None and samples.outliers.rejected_count == 4
     assert inflation.rejected_axes.tolist() == [False] * 3 + [True, False, False]
     assert inflation.turn_rad == 0.0 and inflation.speed_m_s == pytest.approx(4 * 50 * 0.005, abs=0.2)
-    assert samples.inflation(108 * STEP, 118 * STEP) is None
+    assert samples.outliers.inflation(108 * STEP, 118 * STEP) is None
     assert not set(range(104, 108)) & set((samples.samples.stamps_ns // STEP).tolist())
 
 
@@ -110,12 +110,12 @@ def test_rejected_samples_inflate_one_frame_only() -> None:
     values[110, 3] += 50.0  # the sample after the image's time that came with it
     samples.add(batch(values[:111]))
     at = 110 * STEP - 1_500_000
-    assert samples.inflation(100 * STEP, at) is None
-    assert samples.inflation(100 * STEP, 110 * STEP) is None
+    assert samples.outliers.inflation(100 * STEP, at) is None
+    assert samples.outliers.inflation(100 * STEP, 110 * STEP) is None
     samples.add(batch(values[111:121], 111))
-    inflation = samples.inflation(at, at + 10 * STEP)
+    inflation = samples.outliers.inflation(at, at + 10 * STEP)
     assert inflation is not None and inflation.rejected_axes[3]
-    assert samples.inflation(110 * STEP, 120 * STEP) is not None
+    assert samples.outliers.inflation(110 * STEP, 120 * STEP) is not None
 
 
 def test_a_copy_with_later_samples_leaves_the_buffer_unchanged() -> None:
@@ -123,10 +123,10 @@ def test_a_copy_with_later_samples_leaves_the_buffer_unchanged() -> None:
     values[100:104, 0] += 20.0
     samples.add(batch(values[:98]))
     ahead = samples.extended(batch(values[98:110], 98))
-    assert (ahead.rejected_count, samples.rejected_count) == (4, 0)
-    assert samples.inflation(98 * STEP, 110 * STEP) is None
+    assert (ahead.outliers.rejected_count, samples.outliers.rejected_count) == (4, 0)
+    assert samples.outliers.inflation(98 * STEP, 110 * STEP) is None
     samples.add(batch(values[98:110], 98))
-    assert samples.rejected_count == 4
+    assert samples.outliers.rejected_count == 4
 
 
 # ---------------------------------------------------------------- beginnings: the first, and after a gap
@@ -150,7 +150,7 @@ def begun(
         good |= dict.fromkeys(np.searchsorted(stamps, breaks.retracted_ns).tolist(), False)
         samples.add(ImuBatch(stamps[part], values[part, :3], values[part, 3:]))
     out = [k for k, is_good in good.items() if not is_good]
-    assert samples.rejected_count == breaks.rejected_count == len(out)
+    assert samples.outliers.rejected_count == breaks.rejected_count == len(out)
     assert set(samples.samples.stamps_ns.tolist()) == set(np.delete(stamps, out).tolist())
     return out, breaks, samples
 
@@ -241,10 +241,10 @@ def test_a_copy_with_later_samples_retracts_nothing() -> None:
     samples, values = ImuBuffer(), walking(60)
     values[0, 3] += 80.0
     samples.add(batch(values[:1]))
-    assert samples.extended(batch(values[1:10], 1)).rejected_count == 1
-    assert (samples.rejected_count, len(samples.samples)) == (0, 1)
+    assert samples.extended(batch(values[1:10], 1)).outliers.rejected_count == 1
+    assert (samples.outliers.rejected_count, len(samples.samples)) == (0, 1)
     samples.add(batch(values[1:10], 1))
-    assert (samples.rejected_count, samples.samples.stamps_ns[0]) == (1, STEP)
+    assert (samples.outliers.rejected_count, samples.samples.stamps_ns[0]) == (1, STEP)
 
 
 def test_time_is_linear_in_the_samples_of_a_frame() -> None:

@@ -15,10 +15,10 @@ from helpers.reports import recorded_reports
 from share.config import AgentQoe, Config, ControlConfig, EdgeConfig
 from share.geometry import se3
 from share.mapping import query_queue
+from share.mapping.candidates import MAX_BACKLOG_CANDIDATES, MAX_VERIFIED
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
-from share.mapping.query_queue import MAX_VERIFIED
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import QueryStep, SolveStep, VerifyStep
 from share.protocol import agent_events as ev
@@ -428,7 +428,7 @@ def test_while_queries_wait_fewer_candidates_are_tried(monkeypatch):
             mapper.finish_step(verify, Refusal("not it") if refuse else same, 1.0)
     assert [tried[0, True], tried[0, False]] == [config.place.candidates, MAX_VERIFIED]
     assert [tried[query_queue.MIN_BACKLOG, True], tried[query_queue.MIN_BACKLOG, False]] == [
-        query_queue.MAX_BACKLOG_CANDIDATES,
+        MAX_BACKLOG_CANDIDATES,
         1,
     ]
 

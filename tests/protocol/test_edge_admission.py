@@ -254,10 +254,10 @@ def test_no_tracker_starts_for_a_run_that_may_not_return() -> None:
 
 
 class FullRoom(POLICIES["share"]):
-    """Headsets have room in place of robots; robots have none."""
+    """Headsets have room in place of robots; after the first moment robots have none."""
 
     def objection(self, agent, kind, now_ns):
-        return "no air for one more robot" if kind is AgentKind.ROBOT else None
+        return "no air for one more robot" if kind is AgentKind.ROBOT and now_ns > 0 else None
 
     def displaced(self, agent, kind, now_ns):
         return ("bob",) if agent == "carl" else ()
@@ -269,10 +269,10 @@ def robot(name, run_id):
 
 @pytest.fixture
 def full_edge(monkeypatch):
+    monkeypatch.setitem(POLICIES, "share", FullRoom)
     edge = EdgeProtocol(Config(edge=EdgeConfig(policy="share")), 7)
     come(edge, "ann", 1)
     tell(edge, 2, robot("bob", 2))
-    monkeypatch.setattr(edge._rate_scheduler, "_policy", FullRoom(Config().control))
     return edge
 
 

@@ -64,6 +64,6 @@ def test_a_new_session_of_the_edge_has_asked_for_nothing() -> None:
 def test_a_welcome_may_hold_keyframes_for_a_while() -> None:
     pace = KeyframePace()
     pace.hold(250.0, S)
-    assert pace.next_send_ns(S) == pace.next_send_ns(S + S // 4) == S + S // 4
-    assert pace.next_send_ns(2 * S) == 2 * S
+    assert pace.is_holding(S) and pace.is_holding(S + S // 4 - 1)
+    assert not pace.is_holding(S + S // 4) and not pace.is_holding(2 * S)
     assert pace.take(CANDIDATE, 0, S)  # it is made, and sent later

@@ -348,7 +348,7 @@ def test_a_join_that_is_undone_takes_objects_back_with_their_agents() -> None:
 
 def test_a_new_segment_of_odometry_moves_nothing() -> None:
     bench, _, bob = two_maps()
-    bench.edge.room.begin_segment(bob, 40)
+    bench.edge.room.maps.begin_segment(bob, 40)
     bench.correct(bob, "bob-2/1", np.eye(4), keyframe=40)
     bench.correct(bob, MAP, JOIN, keyframe=10)  # of the segment before: the agent ignores it
     bench.run(0.2)
@@ -372,7 +372,7 @@ def test_a_chain_of_joins_is_followed() -> None:
 def test_an_object_whose_map_is_gone_is_removed_with_that_reason() -> None:
     bench, ann, bob = two_maps()
     for run in (ann, bob):
-        bench.edge.room.forget_run(run)
+        bench.edge.room.maps.forget(run)
     bench.solved(MAP)
     bench.run(0.5)
     assert set(bench.clients[bench.ann].objects) == {1, 2}

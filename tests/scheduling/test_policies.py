@@ -14,7 +14,7 @@ from share.scheduling.policies import POLICIES, AgentReport, PidState, Policy, p
 from share.scheduling.qoe import QoeParameters, qoe
 from share.scheduling.room_budget import (
     JOINING_HZ,
-    LEAST_HZ,
+    MIN_HZ,
     RateGrant,
     first_grant,
     scarce_grant,
@@ -231,7 +231,7 @@ def test_fixed_is_one_rate_for_all_from_the_first_keyframe_on() -> None:
 def test_share_begins_slowly_and_yields_where_keyframes_take_long() -> None:
     share, least = (
         made("share", ControlConfig()),
-        scarce_grant(AgentKind.AR, LEAST_HZ[AgentKind.AR]),
+        scarce_grant(AgentKind.AR, MIN_HZ[AgentKind.AR]),
     )
     assert share.is_windowed and share.first_grant("ann", AgentKind.AR, 0) == first_grant(AgentKind.AR)
     assert share.first_grant("bob", AgentKind.ROBOT, 0) == first_grant(AgentKind.ROBOT)

@@ -28,7 +28,7 @@ def random_room(rng: np.random.Generator, count: int) -> RoomBudget:
         terms = TERMS[ROBOT if rng.random() < robots else AR]
         own_ms = keyframe_ms * rng.uniform(0.5, 2.0)
         agents[f"a{k}"] = AgentDemand(
-            terms=replace(terms, signed=bool(rng.random() < 0.1)),
+            qoe=replace(terms, signed=bool(rng.random() < 0.1)),
             wanted_hz=rng.uniform(0.1, 5.0),
             keyframe_s=own_ms / 1e3,
             arrival_s=max(0.0, own_ms * rng.uniform(0.8, 1.2) - 4) / 1e3,

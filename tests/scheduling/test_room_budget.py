@@ -14,7 +14,7 @@ from share.config import AgentQoe, ControlConfig
 from share.scheduling.qoe import QoeParameters, QoeTable, qoe
 from share.scheduling.room_budget import (
     JOINING_HZ,
-    LEAST_HZ,
+    MIN_HZ,
     OTHER_HZ,
     SCARCE_POSE_HZ,
     AgentDemand,
@@ -37,7 +37,7 @@ def agent(kind: AgentKind = AR, keyframe_ms: float = 40.0, **given: float) -> Ag
     fields = {"wanted_hz": 1.5, "delay_ms": 60 + keyframe_ms, "error_cm": 1.5, "drift_cm": 1.0} | given
     rates = {"hz": 1.0, "pose_hz": 30.0, "updated_ns": 0}
     air = {"keyframe_s": keyframe_ms / 1e3, "arrival_s": max(0.0, keyframe_ms - AT_ONCE_MS) / 1e3}
-    return AgentDemand(terms=TERMS[kind], **(rates | air | fields))  # type: ignore[arg-type]
+    return AgentDemand(qoe=TERMS[kind], **(rates | air | fields))  # type: ignore[arg-type]
 
 
 def room(*agents: AgentDemand) -> RoomBudget:
@@ -62,7 +62,7 @@ def test_where_the_air_is_short_robots_yield_and_poses_are_thinned() -> None:
     air.play(20)
     for kind, grant in zip(air.kinds, air.grants, strict=True):
         assert grant.pose_hz == SCARCE_POSE_HZ[kind]
-        assert LEAST_HZ[kind] <= grant.hz <= 1.5
+        assert MIN_HZ[kind] <= grant.hz <= 1.5
     headsets, robots = (
         [g.hz for k, g in zip(air.kinds, air.grants, strict=True) if k is kind] for kind in (AR, ROBOT)
     )
@@ -162,12 +162,12 @@ def test_more_goes_to_whom_it_gains_more() -> None:
 def test_a_robot_delays_no_headset_unless_it_has_the_ar_form() -> None:
     """`control.agents` gives the latency-critical one that form."""
     bob = ControlConfig(agents={"bob": AgentQoe(form="ar")})
-    urgent = replace(agent(ROBOT), terms=QoeParameters.from_config(bob, ROBOT, "bob"))
+    urgent = replace(agent(ROBOT), qoe=QoeParameters.from_config(bob, ROBOT, "bob"))
     granted = room(agent(AR), agent(ROBOT), urgent).allocate()[0]
-    assert granted["a1"] == scarce_grant(ROBOT, LEAST_HZ[ROBOT])
+    assert granted["a1"] == scarce_grant(ROBOT, MIN_HZ[ROBOT])
     assert granted["a2"] == granted["a0"]
     among_robots = room(agent(ROBOT), agent(ROBOT)).allocate()[0]
-    assert among_robots["a0"].hz > LEAST_HZ[ROBOT]
+    assert among_robots["a0"].hz > MIN_HZ[ROBOT]
 
 
 def test_an_agent_that_shares_a_map_with_nobody_has_the_air_that_is_idle() -> None:
@@ -175,7 +175,7 @@ def test_an_agent_that_shares_a_map_with_nobody_has_the_air_that_is_idle() -> No
     robot = agent(ROBOT, 80.0, wanted_hz=20.0)
     alone = room(*[agent(AR, 80.0)] * 6, replace(robot, is_placed=False))
     placed, joins = (budget.allocate()[0] for budget in (room(*[agent(AR, 80.0)] * 6, robot), alone))
-    assert placed["a6"].hz == LEAST_HZ[ROBOT] and 2 * JOINING_HZ < joins["a6"].hz < 20.0
+    assert placed["a6"].hz == MIN_HZ[ROBOT] and 2 * JOINING_HZ < joins["a6"].hz < 20.0
     assert all(joins[f"a{k}"] == placed[f"a{k}"] for k in range(6))
     air_s = alone.airtime_s(robot)
     load = sum(air_s * grant.hz + (grant.pose_hz + OTHER_HZ) * message_s(air_s) for grant in joins.values())
@@ -223,7 +223,7 @@ def test_no_report_breaks_it(reported: list[AgentDemand]) -> None:
     assert budget.is_short() in (True, False)
     for name, grant in budget.allocate()[0].items():
         one = budget.agents[name]
-        assert min(LEAST_HZ[one.terms.form], one.wanted_hz) <= grant.hz <= one.wanted_hz
+        assert min(MIN_HZ[one.qoe.form], one.wanted_hz) <= grant.hz <= one.wanted_hz
 
 
 def test_all_at_once_have_the_qoe_of_each():

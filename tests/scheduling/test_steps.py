@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.modelled_air import STEP_S, Air
 
-from share.scheduling.room_budget import LEAST_HZ, SMALL_SIZE
+from share.scheduling.room_budget import MIN_HZ, SMALL_SIZE
 from share.types import AgentKind
 
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
@@ -37,7 +37,7 @@ def test_half_the_air() -> None:
     air.play(30)
     assert settled(air, 47, 60)
     assert all(rates[-1] <= 1 for rates in headsets(air, 30, 60))
-    assert all(min(rates) >= LEAST_HZ[AR] for rates in headsets(air, 30, 60))
+    assert all(min(rates) >= MIN_HZ[AR] for rates in headsets(air, 30, 60))
     air.alone_ms /= 2
     air.play(20)
     assert settled(air, 68, 80)

@@ -143,7 +143,7 @@ def test_images_of_schema_3_move_to_their_table(path: Path, is_damaged: bool) ->
     sent = [keyframe(ANN, i).keyframe.image.jpeg.tobytes() for i in range(4)]
     before = path.read_bytes()
     found = MapStore.read(path).load().keyframes
-    assert [(k.keyframe.image.jpeg.tobytes(), k.came_s) for k in found] == [(jpeg, None) for jpeg in sent]
+    assert [(k.keyframe.image.jpeg.tobytes(), k.arrived_s) for k in found] == [(jpeg, None) for jpeg in sent]
     assert path.read_bytes() == before
     if is_damaged:
         path.write_bytes(bytes(100) + before[100:])
@@ -154,7 +154,7 @@ def test_images_of_schema_3_move_to_their_table(path: Path, is_damaged: bool) ->
     assert len(store.problems) == 2 * is_damaged
     assert [len(k.keyframe.image.jpeg) for k in found] == [0] * 4
     assert [len(k.keyframe.image.uv) for k in found] == [3] * 4
-    assert all(k.came_s is not None and 0 <= k.came_s - opened_s < 60 for k in found)
+    assert all(k.arrived_s is not None and 0 <= k.arrived_s - opened_s < 60 for k in found)
     assert [jpeg_bytes(KeyframeArchive(path).jpeg(KeyframeKey(ANN, i))) for i in range(4)] == sent
     assert sent[2] not in b"".join(rows.keyframe_row(k, 0, 0)[-1] for k in found)
     assert path.read_bytes().count(sent[2]) == 1

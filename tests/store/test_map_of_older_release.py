@@ -38,7 +38,7 @@ def test_a_map_of_an_older_schema_is_converted(old: int, tmp_path: Path) -> None
     assert MapStore.read(path).schema == SCHEMAS[old]
     if SCHEMAS[old] == schema.SCHEMA:
         return  # nothing to convert
-    assert {found.came_s for found in MapStore.read(path).load().keyframes} == {None}
+    assert {found.arrived_s for found in MapStore.read(path).load().keyframes} == {None}
     opened_s = int(time.time())
     with MapStore.open(path) as store:
         assert store.schema == schema.SCHEMA
@@ -46,8 +46,8 @@ def test_a_map_of_an_older_schema_is_converted(old: int, tmp_path: Path) -> None
         assert len(store.load().keyframes) == KEYFRAMES[old]
     converted = MapStore.read(path)
     assert converted.load().problems == ()
-    times = {found.came_s for found in converted.load().keyframes}
-    assert all(came_s is not None and 0 <= came_s - opened_s < 60 for came_s in times)
+    times = {found.arrived_s for found in converted.load().keyframes}
+    assert all(arrived_s is not None and 0 <= arrived_s - opened_s < 60 for arrived_s in times)
 
 
 def test_reading_an_older_schema_leaves_the_file_as_it_is(old: int, tmp_path: Path) -> None:

@@ -146,9 +146,9 @@ class _ClaimsMapper(Mapper):
         map_events = super().finish_step(step, result, ms)
         if isinstance(step, VerifyStep):
             agreement = self.atlas.quarantine.agreement
-            for names, doubt in agreement.contradictions().items():
+            for names, compared in agreement.pairs.items():
                 pair = frozenset(names)
-                self._doubts[pair] = max(doubt, self._doubts.get(pair, 0.0))
+                self._doubts[pair] = max(compared.severity, self._doubts.get(pair, 0.0))
                 if agreement.are_separated(*names):
                     self._were_apart.add(pair)
         return map_events

@@ -23,9 +23,10 @@ import numpy as np
 from share.config import Config
 from share.geometry import se3
 from share.geometry.camera import Rig
+from share.mapping.candidates import CandidateSearch
 from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.map_changes import MapChange
-from share.mapping.query_queue import CandidateSearch, QueryQueue, service_kind
+from share.mapping.query_queue import QueryQueue, service_kind
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.segments import MIN_LOOP_GAP
 from share.scheduling.merge_gate import Frustum, MergeGate, SampledFrustum, overlap_volumes

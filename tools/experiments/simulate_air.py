@@ -261,7 +261,7 @@ def play(
     who = list(made.agents.values())
     world, truth, seconds = begin(SampledSimulation, made, config, air, seed, by_sigma, is_alone)
     if constant is not None:
-        world.edge._rate_scheduler._policy = ConstantRates(config.control, constant)
+        world.edge._rate_scheduler.policy = ConstantRates(config.control, constant)
     if halved is not None:
         _halve(world, *map(float, halved.split(":")))
     if late_s is not None:

@@ -210,7 +210,7 @@ def _pool_scales(scales: Collection[DepthScale]) -> ScalarEstimate | None:
 
 def _most_redundant_loop(loops: list[InterAgentLoop]) -> int:
     """Index of the older of the two loops whose ends are closest."""
-    positions = np.array([(w.a.index, w.b.index) for w in loops])
+    positions = np.array([(loop.a.index, loop.b.index) for loop in loops])
     distance = np.abs(positions[:, None] - positions[None]).sum(2).astype(float)
     np.fill_diagonal(distance, np.inf)
     first, second = np.unravel_index(int(distance.argmin()), distance.shape)
@@ -239,10 +239,10 @@ def tilt_between(
 
 def gravity_contradictions(loops: list[InterAgentLoop]) -> list[Contradiction]:
     """Contradiction between the two agents' up directions, if enough loops know them."""
-    with_tilt = [w for w in loops if w.tilt is not None]
+    with_tilt = [loop for loop in loops if loop.tilt is not None]
     if len(with_tilt) < _MIN_TILTS or _count_views(with_tilt) < _MIN_VIEWS:
         return []
-    known = np.array([w.tilt for w in with_tilt])
+    known = np.array([loop.tilt for loop in with_tilt])
     angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
     text = f"its up direction is {np.degrees(angle):.1f} degrees off"
     return [(min(angle / _MAX_TILT_RAD, sigmas / _MIN_SIGMAS), text, text)]

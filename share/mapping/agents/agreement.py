@@ -146,7 +146,7 @@ class AgentAgreement:
             first, second, segments, edge = second, first, segments[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
         pair = self.pairs.setdefault((first, second), AgentPair())
-        self.covariance_scales.claims.link(first, second)
+        self.covariance_scales.stated.link(first, second)
         a, b = self._accumulated[edge.a], self._accumulated[edge.b]
         if not pair.add_loop(segments, InterAgentLoop(a, b, edge.T_a_b, edge.cov, scale, tilt)):
             return False
@@ -213,14 +213,9 @@ class AgentAgreement:
             return "an earlier run of its name was kept in a separate map"
         return "the edge has restarted"
 
-    def contradictions(self) -> dict[AgentNames, float]:
-        """Severity of the contradictions of each pair (names in order); 1 begins a disagreement."""
-        return {names: pair.severity for names, pair in self.pairs.items()}
-
     def _compare(self, pair: AgentPair, names: AgentNames, segment_pair: SegmentPair) -> None:
-        min_scale = self.covariance_scales.claims.min_scale
-        claims = min_scale(names[0]), min_scale(names[1])
-        equations = pair.compare(segment_pair, claims)
+        min_scale = self.covariance_scales.stated.min_scale
+        equations = pair.compare(segment_pair, (min_scale(names[0]), min_scale(names[1])))
         if pair.disagrees:
             self.covariance_scales.drop_evidence(pair.by_segments)
             return

@@ -12,7 +12,7 @@ a variance-components model. With P the inverse covariance that projects out G, 
 for any factors in P, so the equations of all pairs add up; at the solution this is restricted maximum
 likelihood. F is in degrees of freedom over f^2, so a prior of n degrees of freedom adds n of them: with few
 loops the factors stay at 1, or higher for an agent that states much less than the others
-(`CovarianceClaims`). No factor below 1 is applied. Source: C. R. Rao, *Estimation of variance and covariance
+(`StatedCovariances`). No factor below 1 is applied. Source: C. R. Rao, *Estimation of variance and covariance
 components: MINQUE theory*, J. Multivariate Analysis 1, 1971; Patterson and Thompson, *Biometrika* 58, 1971.
 """
 
@@ -28,50 +28,20 @@ from share.geometry import se3
 from share.mapping.agents.pairwise import ComparisonEquations
 from share.types import F64, I64
 
-# Added to an odometry step's standard deviation: fixed, and per rad and m of the step.
-_FLOOR_DEG = 0.002
-_FLOOR_M = 0.0002
-_FLOOR_PER_RAD = 0.0005
-_FLOOR_PER_M = 0.003
-
-
-def inflate_covariance(T_ref_body: F64, cov: F64) -> F64:
-    """Covariance (6, 6) of an odometry step as the graph uses it.
-
-    A floor that grows with the step is added in quadrature; `CovarianceScales` scales what agents understate.
-    """
-    return cov + _floor(T_ref_body)
-
-
-def inflate_span(T_earlier_body: F64, cov: F64, steps: int) -> F64:
-    """Covariance (6, 6) of odometry over several steps as the graph uses it: with the floor of that many
-    equal steps, so that an agent's spans, which `CovarianceClaims` does not see, cannot be certain.
-    """
-    return cov + steps * _floor(T_earlier_body, steps)
-
-
-def _floor(T: F64, steps: int = 1) -> F64:
-    """Covariance (6, 6) added to each of `steps` equal steps that make T (4, 4)."""
-    angle_rad, length_m = float(se3.rotation_angle(T)) / steps, float(np.linalg.norm(T[:3, 3])) / steps
-    rad2 = np.radians(_FLOOR_DEG) ** 2 + (_FLOOR_PER_RAD * angle_rad) ** 2
-    m2 = _FLOOR_M**2 + (_FLOOR_PER_M * length_m) ** 2
-    return np.diag([rad2] * 3 + [m2] * 3)
-
-
 _MAX_STEPS = 64  # newest of each agent
 _MIN_STEPS = 8
-_CLAIM_TOLERANCE = 2.25  # variance (1.5 sigma), by which good agents differ as they move differently
-_MAX_CLAIM_SCALE = 100.0  # variance; without evidence from loops no more is applied
+_STATED_TOLERANCE = 2.25  # variance (1.5 sigma), by which good agents differ as they move differently
+_MAX_STATED_SCALE = 100.0  # variance; without evidence from loops no more is applied
 _SAME_MEDIAN = 0.02  # of the logarithm; with a smaller change, all agents' scales need not be estimated anew
 _LEVER_M = 1.0  # length of a step equivalent to a rotation of 1 rad
 
 
-class CovarianceClaims:
+class StatedCovariances:
     """Compares the covariances that agents state for their steps.
 
     Before loops give evidence, the agent that states the least would bend the others in a merge. So until
     then no agent counts as much more certain than the best of the others, by the median variance of its steps
-    over their size, for position and rotation. Covariances come here inflated (`inflate_covariance`): a claim
+    over their size, for position and rotation. Covariances come here inflated (`inflate_covariance`), so one
     far below the floor counts as the floor.
     """
 
@@ -127,7 +97,7 @@ class CovarianceClaims:
             return 1.0
         smallest = np.min(others, axis=0)
         ratio = float(np.exp((smallest - self._medians[agent]).max()))
-        return min(max(1.0, ratio / _CLAIM_TOLERANCE), _MAX_CLAIM_SCALE)
+        return min(max(1.0, ratio / _STATED_TOLERANCE), _MAX_STATED_SCALE)
 
 
 _MIN_LOOP_WEIGHT = 0.4  # false loops are no evidence on odometry
@@ -159,9 +129,9 @@ class _VarianceEvidence:
 class CovarianceScales:
     """scales: factor on the variances of each agent's odometry; 1 where missing. evidence: by segments."""
 
-    def __init__(self, claims: CovarianceClaims | None = None) -> None:
+    def __init__(self, stated: StatedCovariances | None = None) -> None:
         self.scales: dict[str, float] = {}
-        self.claims = CovarianceClaims() if claims is None else claims
+        self.stated = StatedCovariances() if stated is None else stated
         self._estimates: dict[str, float] = {}  # before thresholds
         self._loop_scales: dict[SegmentPair, float] = {}
         self.evidence: dict[SegmentPair, _VarianceEvidence] = {}
@@ -169,7 +139,7 @@ class CovarianceScales:
     def add_step(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
         """Add a step (4, 4) of an agent's odometry with its covariance (6, 6); return whether scales may have
         changed."""
-        if is_compared := self.claims.add_step(agent, T_ref_body, cov):
+        if is_compared := self.stated.add_step(agent, T_ref_body, cov):
             self._estimate()
         return is_compared
 
@@ -180,12 +150,12 @@ class CovarianceScales:
 
         Raises LinAlgError where absurd numbers leave no solution.
         """
-        self.claims.link(*agents)
+        self.stated.link(*agents)
         inliers = np.flatnonzero(weights > _MIN_LOOP_WEIGHT)
         if len(inliers) < _MIN_LOOPS:
             self.drop_evidence([segment_pair])
             return
-        estimates = [self._estimates.get(agent, self.claims.min_scale(agent)) for agent in agents]
+        estimates = [self._estimates.get(agent, self.stated.min_scale(agent)) for agent in agents]
         factors = np.array([*estimates, self._loop_scales.get(segment_pair, _LOOP_PRIOR_SCALE)])
         self.evidence[segment_pair] = _VarianceEvidence(
             agents, *_variance_components(equations, inliers, factors), factors
@@ -194,33 +164,20 @@ class CovarianceScales:
 
     def drop_evidence(self, segment_pairs: Iterable[SegmentPair]) -> None:
         """Drop the evidence of these segments: their odometries contradict, or are removed."""
-        dropped = [
-            segment_pair
-            for segment_pair in segment_pairs
-            if self.evidence.pop(segment_pair, None) is not None
-        ]
+        dropped = [pair for pair in segment_pairs if self.evidence.pop(pair, None) is not None]
         if dropped:
             self._estimate()
 
     def exclude(self, agents: Collection[str]) -> None:
-        """Drop the evidence of these agents, and compare no claims with theirs."""
-        if self.claims.exclude(agents):
+        """Drop the evidence of these agents, and compare no stated covariances with theirs."""
+        if self.stated.exclude(agents):
             self._estimate()
-        self.drop_evidence(
-            [
-                segment_pair
-                for segment_pair, evidence in self.evidence.items()
-                if set(evidence.agents) & set(agents)
-            ]
-        )
+        excluded = set(agents)
+        self.drop_evidence([pair for pair, one in self.evidence.items() if excluded & set(one.agents)])
 
     def remove_agent(self, agent: str) -> None:
-        self.evidence = {
-            segment_pair: evidence
-            for segment_pair, evidence in self.evidence.items()
-            if agent not in evidence.agents
-        }
-        self.claims.remove_agent(agent)
+        self.evidence = {pair: one for pair, one in self.evidence.items() if agent not in one.agents}
+        self.stated.remove_agent(agent)
         self._estimate()
         self.scales.pop(agent, None)
 
@@ -234,8 +191,8 @@ class CovarianceScales:
             q[rows] += evidence.q
             F[np.ix_(rows, rows)] += evidence.F
             linearised_at[rows] = np.minimum(linearised_at[rows], evidence.linearised_at)
-        claimed = np.array([self.claims.min_scale(name) for name in agents])
-        prior = np.append(claimed, np.full(len(self.evidence), _LOOP_PRIOR_SCALE))
+        min_scales = np.array([self.stated.min_scale(name) for name in agents])
+        prior = np.append(min_scales, np.full(len(self.evidence), _LOOP_PRIOR_SCALE))
         dof = np.append(np.full(n, _PRIOR_DOF), np.full(len(self.evidence), _LOOP_PRIOR_DOF))
         prior_information = dof / np.where(linearised_at < _MAX_SCALE, linearised_at, prior) ** 2
         estimates = np.linalg.solve(F + np.diag(prior_information), q + prior_information * prior).clip(
@@ -243,8 +200,8 @@ class CovarianceScales:
         )
         self._loop_scales = dict(zip(self.evidence, estimates[n:].tolist(), strict=True))
         self._estimates = dict(zip(agents, estimates[:n].tolist(), strict=True))
-        for name in sorted({*agents, *self.scales, *self.claims.known_agents}):
-            self._update_scale(name, self._estimates.get(name, self.claims.min_scale(name)))
+        for name in sorted({*agents, *self.scales, *self.stated.known_agents}):
+            self._update_scale(name, self._estimates.get(name, self.stated.min_scale(name)))
 
     def _update_scale(self, name: str, estimate: float) -> None:
         previous = self.scales.get(name, 1.0)

@@ -32,7 +32,8 @@ _IRLS_ITERATIONS = 6
 _CHI2_6DOF_MEDIAN = 5.35
 _PRIOR_SIGMAS = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad; so that two loops have a solution
 _MAD_PER_SIGMA = 0.6745  # median of |x| of a standard normal distribution
-_HERE_M, _HERE_RAD = 1.0, 0.5  # a loop that deviates by more is of another place that looks alike, not noisy
+# A loop that deviates by more is not noisy: it joins two places that look alike.
+_SAME_PLACE_M, _SAME_PLACE_RAD = 1.0, 0.5
 _MIN_INLIER_WEIGHT = 0.3  # of a loop that fits
 _LOG_SCALE_FLOOR = 0.004  # added sigma of one loop's depth scale: occlusions, pixels
 _AS_STATED = (1.0, 1.0)
@@ -152,19 +153,17 @@ def compare_odometry(
 
 def comparison_equations(loops: Sequence[InterAgentLoop]) -> ComparisonEquations:
     """Equations of loops between the same two segments, about the centre of their positions."""
-    T_a, T_b, T_a_b = (np.array(x) for x in zip(*((w.a.T, w.b.T, w.T_a_b) for w in loops), strict=True))
+    ends = ((loop.a.T, loop.b.T, loop.T_a_b) for loop in loops)
+    T_a, T_b, T_a_b = (np.array(x) for x in zip(*ends, strict=True))
     T_centre = np.eye(4)
     T_centre[:3, 3] = -(T_a @ T_a_b)[:, :3, 3].mean(0)
     Ad = se3.adjoint(T_centre)
     T_a = T_centre @ T_a
     G = _consensus_pose(T_a @ T_a_b @ se3.inverse(T_b))
-    walk_cov_a, walk_cov_b = (
-        _shared_walk_cov([w.a for w in loops], Ad),
-        _shared_walk_cov([w.b for w in loops], se3.adjoint(G)),
-    )
-    loop_cov = (
-        se3.adjoint(T_a @ T_a_b) @ np.array([w.cov for w in loops]) @ se3.adjoint(T_a @ T_a_b).swapaxes(1, 2)
-    )
+    walk_cov_a = _shared_walk_cov([loop.a for loop in loops], Ad)
+    walk_cov_b = _shared_walk_cov([loop.b for loop in loops], se3.adjoint(G))
+    Ad_loop = se3.adjoint(T_a @ T_a_b)
+    loop_cov = Ad_loop @ np.array([loop.cov for loop in loops]) @ Ad_loop.swapaxes(1, 2)
     xi = se3.log(T_a @ T_a_b @ se3.inverse(T_b) @ se3.inverse(G))
     return ComparisonEquations(xi, _jacobian(T_a @ T_a_b), walk_cov_a, walk_cov_b, loop_cov)
 
@@ -178,8 +177,8 @@ def _consensus_pose(Z: F64) -> F64:
 
 def _shared_walk_cov(accumulated: Sequence[AccumulatedOdometry], Ad: F64) -> F64:
     """Covariance (N, 6, N, 6) that N loops share through one side's random walk since the first of them."""
-    indices: I64 = np.array([w.index for w in accumulated])
-    P = np.array([w.cov for w in accumulated])
+    indices: I64 = np.array([loop.index for loop in accumulated])
+    P = np.array([loop.cov for loop in accumulated])
     P = Ad @ (P - P[indices.argmin()]) @ Ad.T
     earlier = np.where(indices[:, None] <= indices, np.arange(len(indices))[:, None], np.arange(len(indices)))
     return np.asarray(P[earlier].transpose(0, 2, 1, 3))
@@ -230,8 +229,8 @@ def _solve(e: ComparisonEquations, covariance_scales: tuple[float, float]) -> Od
         noise = (loop_cov @ weighted[:, :, None])[:, :, 0] / weight[:, None]  # the loops' part of it
         chi2 = np.einsum("ni,nij,nj->n", noise, loop_information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY_WIDTH_SQUARED)
-    is_here = (np.abs(residual.reshape(n, 6)) < [_HERE_RAD] * 3 + [_HERE_M] * 3).all(axis=1)
-    nis = float(np.median(chi2[is_here])) / _CHI2_6DOF_MEDIAN if is_here.any() else 0.0
+    is_same_place = (np.abs(residual.reshape(n, 6)) < [_SAME_PLACE_RAD] * 3 + [_SAME_PLACE_M] * 3).all(axis=1)
+    nis = float(np.median(chi2[is_same_place])) / _CHI2_6DOF_MEDIAN if is_same_place.any() else 0.0
     misfit = float(residual @ weighted.ravel()) / max(1, 6 * n - 10)  # shows a wrong model
     cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
     rotation = theta[7:]

@@ -1,4 +1,5 @@
-"""Keeps agents that disagree with the others out of their maps, or takes them out when the evidence is late.
+"""Keeps agents that disagree with the others out of their maps, and removes them where the evidence comes
+later.
 
 Small scale errors are corrected, and understated variances enlarged.
 """
@@ -99,15 +100,11 @@ class Quarantine:
 
     def separation_reason(self, loop: Loop) -> str:
         """Why the loop must not be accepted: it would connect agents kept in separate maps; else empty."""
-        reference_segments = self._graph.reference_segment(loop.a), self._graph.reference_segment(loop.b)
-        if reference_segments[0] == reference_segments[1]:
+        first, second = (self._graph.reference_segment(key) for key in (loop.a, loop.b))
+        if first == second:
             return ""
-        first_agents, second_agents = (
-            self._agents_in_map(reference_segment) for reference_segment in reference_segments
-        )
-        return self.agreement.unverified_reason(
-            first_agents, second_agents
-        ) or self.agreement.separation_reason(first_agents, second_agents)
+        agents = self._agents_in_map(first), self._agents_in_map(second)
+        return self.agreement.unverified_reason(*agents) or self.agreement.separation_reason(*agents)
 
     def rescale_loop(self, loop: Loop, depth_scale: DepthScale | None) -> Loop:
         """Correct a loop for the agents' scales, where known.
@@ -200,11 +197,11 @@ class Quarantine:
         Those still forbidden are withdrawn again, while their keyframes exist.
         """
         odometry, decisions = self._graph.odometry, list[LoopDecision]()
-        most_comparisons = self._loop_acceptance.comparison_count + _COMPARED_AT_ONCE
+        max_comparisons = self._loop_acceptance.comparison_count + _COMPARED_AT_ONCE
         while (
             self._to_reconsider
             and len(decisions) < _RECONSIDERED_AT_ONCE
-            and self._loop_acceptance.comparison_count < most_comparisons
+            and self._loop_acceptance.comparison_count < max_comparisons
         ):
             loop = self._to_reconsider.pop(0)
             if not (odometry.has_keyframe(loop.a) and odometry.has_keyframe(loop.b)):

@@ -7,7 +7,7 @@ Barfoot, *State Estimation for Robotics* (2017), ch. 7; Grisetti et al., *A Tuto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -42,12 +42,45 @@ class PoseEdge:
         return float(self.cov.trace())
 
 
+# Covariances of odometry, as the graph uses them. Added to the standard deviation of each step: fixed, and
+# per rad and m of the step.
+
+_STEP_FLOOR_DEG, _STEP_FLOOR_M = 0.002, 0.0002
+_STEP_FLOOR_PER_RAD, _STEP_FLOOR_PER_M = 0.0005, 0.003
+
+
+def inflate_covariance(T_ref_body: F64, cov: F64) -> F64:
+    """Covariance (6, 6) of an odometry step, with a floor that grows with the step added in quadrature.
+
+    `share.mapping.agents.covariance_scales` scales what agents understate.
+    """
+    return cov + _step_floor(T_ref_body)
+
+
+def inflate_span(T_earlier_body: F64, cov: F64, steps: int) -> F64:
+    """Covariance (6, 6) of odometry over several steps, with the floor of that many equal steps.
+
+    So an agent's spans, which `StatedCovariances` does not see, cannot be certain.
+    """
+    return cov + steps * _step_floor(T_earlier_body, steps)
+
+
+def _step_floor(T: F64, steps: int = 1) -> F64:
+    """Covariance (6, 6) added to each of `steps` equal steps that make T (4, 4)."""
+    angle_rad, length_m = float(se3.rotation_angle(T)) / steps, float(np.linalg.norm(T[:3, 3])) / steps
+    rad2 = np.radians(_STEP_FLOOR_DEG) ** 2 + (_STEP_FLOOR_PER_RAD * angle_rad) ** 2
+    m2 = _STEP_FLOOR_M**2 + (_STEP_FLOOR_PER_M * length_m) ** 2
+    return np.diag([rad2] * 3 + [m2] * 3)
+
+
+# All edges at once
+
 _MIN_SIGMA = 1e-5  # rad and m; a floor, so that singular covariances are harmless
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeArrays:
-    """E edges, indexed like an array.
+    """E edges, indexed like an array. (`ArrayTable` would change the memory layout, and so last digits.)
 
     Ends a, b (E,); measured T_b_a (E, 4, 4); whitening W (E, 6, 6); cov_trace (E,); is_loop (E,): under the
     robust kernel.
@@ -64,28 +97,15 @@ class EdgeArrays:
         return len(self.a)
 
     def __getitem__(self, chosen: Any) -> EdgeArrays:
-        return EdgeArrays(
-            self.a[chosen],
-            self.b[chosen],
-            self.T_b_a[chosen],
-            self.whitening[chosen],
-            self.cov_trace[chosen],
-            self.is_loop[chosen],
-        )
+        return EdgeArrays(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def with_ends(self, a: I64, b: I64) -> EdgeArrays:
         """The same measurements with other indices of their ends."""
         return EdgeArrays(a, b, self.T_b_a, self.whitening, self.cov_trace, self.is_loop)
 
     def concatenate(self, other: EdgeArrays) -> EdgeArrays:
-        return EdgeArrays(
-            np.concatenate([self.a, other.a]),
-            np.concatenate([self.b, other.b]),
-            np.concatenate([self.T_b_a, other.T_b_a]),
-            np.concatenate([self.whitening, other.whitening]),
-            np.concatenate([self.cov_trace, other.cov_trace]),
-            np.concatenate([self.is_loop, other.is_loop]),
-        )
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return EdgeArrays(*map(np.concatenate, pairs))
 
     @staticmethod
     def from_measurements(ends: I64, T_a_b: F64, covs: F64, is_loop: NDArray[np.bool_]) -> EdgeArrays:

@@ -136,11 +136,10 @@ class PoseGraphSolver:
     def solve(self, anchor: int, wanted: Sequence[int] = ()) -> GraphSolution:
         """Return the most likely poses of the component of pose `anchor`.
 
-        The anchor stays, except that all turn slowly upright about it where gravity factors are known: a map
-        that turned at once would move under those who are in it. wanted: poses whose covariances are
-        returned, without the tilt that the whole map shares. An unsolvable component is returned unchanged,
-        with the reason. Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not
-        connected to it.
+        The anchor stays, except that all poses turn slowly upright about it where gravity factors are known:
+        agents would notice a map that turned at once. wanted: poses whose covariances are returned, without
+        the tilt that the whole map shares. An unsolvable component is returned unchanged, with the reason.
+        Deterministic. Raises ValueError if the anchor is unknown or a wanted pose is not connected to it.
         """
         component, component_edges = self._component(anchor)
         pose_ids, edges = self._pose_ids[component], self._edges[component_edges]

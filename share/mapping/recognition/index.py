@@ -224,7 +224,8 @@ def build_page(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> Ind
     starts = np.zeros(vocabulary + 1, np.uint32)
     np.cumsum(np.bincount(keys >> _SLOT_BITS, minlength=vocabulary), out=starts[1:])
     slots = (keys & (MAX_PAGE_KEYFRAMES - 1)).astype(np.uint16)
-    return _new_page(np.array(ids, np.int64), np.array([len(v) for v in views]), starts, slots)
+    sizes = np.array([len(words) for words in views])
+    return IndexPage(np.array(ids, np.int64), sizes, np.ones(len(ids), bool), starts, slots)
 
 
 def merge_in_steps(pages: Sequence[IndexPage]) -> Generator[int, None, IndexPage]:
@@ -288,7 +289,3 @@ def _best(scores: F64, limit: int) -> I64:
     else:
         among = np.arange(len(scores))
     return among[np.argsort(-scores[among], kind="stable")][:limit]
-
-
-def _new_page(ids: I64, sizes: I64, starts: U32, slots: NDArray[np.uint16]) -> IndexPage:
-    return IndexPage(ids, sizes, np.ones(len(ids), bool), starts, slots)

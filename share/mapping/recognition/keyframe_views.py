@@ -70,7 +70,7 @@ class KeyframeViews:
         self.index = PlaceIndex()
         self._archive = archive
         self._known: dict[int, _ResidentKeyframe] = {}
-        self.by_node: Mapping[int, CameraView] = _OnDemand(self._known, self._camera_view)
+        self.by_node: Mapping[int, CameraView] = _LazyViews(self._known, self._camera_view)
         self._images: dict[int, None] = {}  # keyframes with an image
         self._jpegs: OrderedDict[int, U8] = OrderedDict()  # the last used is last, also below
         self._views: OrderedDict[int, PackedView] = OrderedDict()
@@ -226,7 +226,7 @@ class KeyframeViews:
                 kept.move_to_end(oldest)
 
 
-class _OnDemand(Mapping[int, CameraView]):
+class _LazyViews(Mapping[int, CameraView]):
     """The views of all known keyframes, each made when it is asked for."""
 
     def __init__(self, known: Mapping[int, object], make: Callable[[int], CameraView]) -> None:

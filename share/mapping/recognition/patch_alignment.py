@@ -38,7 +38,7 @@ _SIGMA_PX = 0.2  # of an aligned position
 _INLIER_CHI2 = 9.2  # 99 %, 2 degrees of freedom
 _CAUCHY = 2.0  # Mahalanobis distance at which a measurement has half its weight
 _MIN_INLIERS, _MIN_INLIER_SHARE = 25, 0.7  # of the aligned patches
-_MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where nothing but the map's pose says so
+_MIN_FOUND_SHARE = 0.35  # aligned patches, of those in both views, where only the map gave the pose
 _ITERATIONS = 6
 _CONVERGED_STEP = 3e-4  # rad and m, at full size
 _MIN_SHARED_DEPTH, _MAX_SHARED_DEPTH = 1e-3, 1.0  # relative; no baseline is known better
@@ -150,7 +150,7 @@ def align_verified(verified: Verification, query: ImageView, candidate: ImageVie
     if not query.pyramid or not candidate.pyramid:
         return verified  # damaged: nothing to compare
     aligned = align_images(verified.T_c_q, query, candidate)
-    refined = None if aligned is None else _verification(aligned, aligned.found)
+    refined = None if aligned is None else _verification(aligned)
     if isinstance(refined, Verification):
         return refined
     scale = verified.depth_scale
@@ -183,10 +183,9 @@ def align_from_map(T_c_q: F64, query: ImageView, candidate: ImageView) -> Verifi
     the map has; or why there is none.
 
     Coarse images are used only where the map's pose is too far off without: they take twice the time."""
-    at_once = _align_from_map(T_c_q, query, candidate, _FINE)
-    if isinstance(at_once, Verification):
-        return at_once
-    return _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
+    fine = _align_from_map(T_c_q, query, candidate, _FINE)
+    is_found = isinstance(fine, Verification)
+    return fine if is_found else _align_from_map(T_c_q, query, candidate, _COARSE_TO_FINE)
 
 
 def _align_from_map(
@@ -197,21 +196,21 @@ def _align_from_map(
         return Refusal("too few patches align from the map's pose")
     if aligned.found < _MIN_FOUND_SHARE * aligned.predicted:
         return Refusal(f"{aligned.found} of {aligned.predicted} patches align from the map's pose")
-    return _verification(aligned, aligned.found)
+    return _verification(aligned)
 
 
-def _verification(aligned: AlignedLoop, matches: int) -> Verification | Refusal:
+def _verification(aligned: AlignedLoop) -> Verification | Refusal:
     if aligned.inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * aligned.found):
         return Refusal(f"{aligned.inliers} of {aligned.found} aligned patches agree with one pose")
     floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_M**2] * 3)
     distance_m = float(np.linalg.norm(aligned.T_c_q[:3, 3]))
     cov = _SHARED_ERROR**2 * (1 + _WIDE_VARIANCE_PER_M2 * distance_m**2) * (aligned.cov + floor)
-    return Verification(aligned.T_c_q, cov, matches, aligned.inliers, aligned.depth_scale)
+    return Verification(aligned.T_c_q, cov, aligned.found, aligned.inliers, aligned.depth_scale)
 
 
-class _Alignment(NamedTuple):
-    """Features of one view that were aligned in the other. feature (M,): its index; px (M, 2): where.
-    predicted: number of features in the other view."""
+class _AlignedFeatures(NamedTuple):
+    """Features of one view that were aligned in the other: feature (M,), their indices; px (M, 2), their
+    positions there. predicted: number of features that the other view should show."""
 
     feature: I64
     px: F64
@@ -261,7 +260,7 @@ def _transfer(
     return *project(q), q, rho
 
 
-def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignment:
+def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _AlignedFeatures:
     """Align the source's patches in the target's image of a level, from where T (4, 4) puts them."""
     uv, D, _, _ = _transfer(T, source, slice(None))
     by_ray = T[:3, :3] + T[:3, 3, None] * source.plane[:, None, :]  # d q / d ray, along the plane
@@ -273,7 +272,7 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
         inside & (magnification < _MAX_MAGNIFICATION) & (magnification > 1 / _MAX_MAGNIFICATION)
     )
     if len(index) == 0:
-        return _Alignment(index, np.zeros((0, 2)), 0)
+        return _AlignedFeatures(index, np.zeros((0, 2)), 0)
     size = 2.0**level
     kernels = source.kernels(level)[index]
     images = (target.pyramid[level],)
@@ -284,10 +283,10 @@ def _align(T: F64, source: ImageView, target: ImageView, level: int) -> _Alignme
         & (aligned.last_step < _CONVERGED_PX)
         & (distance_px < _REACH_PX)
     )
-    return _Alignment(index[good], size * aligned.px[good].astype(np.float64), len(index))
+    return _AlignedFeatures(index[good], size * aligned.px[good].astype(np.float64), len(index))
 
 
-class _AlignedPose(NamedTuple):
+class _FittedPose(NamedTuple):
     """T (4, 4) of the cameras, covariance (6, 6) of its left perturbation, inliers, and relative depth
     scale."""
 
@@ -303,8 +302,13 @@ def _shared_sigma(query: ImageView, candidate: ImageView) -> float:
 
 
 def _fit_pose(
-    T: F64, query: ImageView, candidate: ImageView, forward: _Alignment, backward: _Alignment, size: float
-) -> _AlignedPose:
+    T: F64,
+    query: ImageView,
+    candidate: ImageView,
+    forward: _AlignedFeatures,
+    backward: _AlignedFeatures,
+    size: float,
+) -> _FittedPose:
     """Fit the pose, and the scale of either view's depths, to all aligned positions. size: px of the image
     per px of the level. Raises LinAlgError where they do not determine it."""
     scale_sigma = np.array([query.shared_depth_sigma, candidate.shared_depth_sigma])
@@ -332,7 +336,7 @@ def _fit_pose(
     if depth_scale is not None:
         pose_sensitivity = cov[:6, 6] / scale_sigma[0] ** 2
         depth_scale = DepthScale(*depth_scale[:2], pose_sensitivity, _shared_sigma(query, candidate))
-    return _AlignedPose(T, cov[:6, :6], int(inlier.sum()), depth_scale)
+    return _FittedPose(T, cov[:6, :6], int(inlier.sum()), depth_scale)
 
 
 def _depth_scale(J: F64, r: F64, log_scales: F64) -> DepthScale | None:
@@ -358,7 +362,7 @@ class _Residuals(NamedTuple):
 
 
 def _residuals(
-    T: F64, source: ImageView, target: ImageView, alignment: _Alignment, size: float, log_scale: float
+    T: F64, source: ImageView, target: ImageView, alignment: _AlignedFeatures, size: float, log_scale: float
 ) -> _Residuals:
     index = alignment.feature
     uv, D, q, rho = _transfer(T, source, index, log_scale)

@@ -59,16 +59,16 @@ class MotionHistory:
         while self._frames[0].stamp_ns <= outcome.stamp_ns - 2 * self._window_ns:
             self._frames.popleft()
 
-    def add_keyframe(self, stamp_ns: int, candidate: OdometryKeyframe) -> RecentMotion:
+    def add_keyframe(self, stamp_ns: int, keyframe: OdometryKeyframe) -> RecentMotion:
         """Add the keyframe with this stamp, that of the last frame or of one shortly before. Return the
         motion up to it."""
         start_ns = stamp_ns - self._window_ns + 1
-        if candidate.new_segment or not self._sigmas:  # no keyframe yet to continue from
+        if keyframe.new_segment or not self._sigmas:  # no keyframe yet to continue from
             self._motions.clear()
             self._sigmas.clear()
             start_ns = stamp_ns
         else:
-            self._motions.append((stamp_ns, candidate.T_previous_body, candidate.cov))
+            self._motions.append((stamp_ns, keyframe.T_previous_body, keyframe.cov))
         while self._frames and self._frames[0].stamp_ns < start_ns:
             self._frames.popleft()
         for entries in (self._motions, self._sigmas):
