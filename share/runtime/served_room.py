@@ -225,6 +225,11 @@ class ServedRoom:
         """Return `series` of edge.json."""
         return self._blinding.covered_series(self._state_machine.series())
 
+    def maps(self) -> Mapping[str, int]:
+        """Return the number of keyframes of each map, by the mapper's newest report."""
+        maps: Mapping[str, int] = self._progress.report.get("maps", {})
+        return maps
+
     def report(self) -> dict[str, Any]:
         """Return edge.json without `series` and what only the edge around the room knows."""
         totals = self._totals.with_totals(self._state_machine.report(self._progress.report))

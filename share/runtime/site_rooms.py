@@ -22,12 +22,18 @@ from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.output_writer import JobThread
 from share.runtime.served_room import RoomHost, ServedRoom
+from share.site.building import RoomMap
 from share.site.directory import PlaceDirectory, RoomRanking
 from share.site.report import site_report
 from share.site.room_switch import RoomSwitch
 from share.store.map_store import MapStore
+from share.timing import Throttle
+from share.wire.codec import encode
 from share.wire.layouts import Bytes
+from share.wire.messages import Refused
 
+_NO_ROOM = "no room of this site lets this name in: add it to `agents` of one in the rooms file"
+_MAPS_S = 5.0  # period in which the building's graph forgets maps that are gone
 _TIMEOUT_S = 5.0  # for the directory's thread at the end
 
 
@@ -54,6 +60,8 @@ class SiteRooms:
         self._directory, self._thread = PlaceDirectory(), JobThread("directory")
         self._rankings: queue.SimpleQueue[RoomRanking] = queue.SimpleQueue()
         self._growing: set[str] = set()
+        self._maps_due_s = 0.0  # monotonic
+        self._refusals = Throttle(1.0, 5.0)
         self._rooms: dict[str, ServedRoom] = {}
         self._switch = RoomSwitch(self._rooms, lambda room, name: self._setups[room].allows(name))
         try:
@@ -76,7 +84,12 @@ class SiteRooms:
         if not isinstance(event, PeerMessageReceived):
             raise TypeError(f"{type(event).__name__} concerns one room")
         room = self._switch.room_of(event.peer_id, event.frames)
-        self._rooms[room].handle(self._limited(event, self._setups[room]))
+        if room is None:
+            self._host.send(event.peer_id, encode(Refused(_NO_ROOM)))
+            if (more := self._refusals.admit("", time.monotonic_ns())) is not None:
+                self._host.log_event("refused", f"{_NO_ROOM} (and {more} more)" if more else _NO_ROOM)
+        else:
+            self._rooms[room].handle(self._limited(event, self._setups[room]))
 
     def _limited(self, event: PeerMessageReceived, setup: RoomSetup) -> PeerMessageReceived:
         """Return the event with the names that may be in the room, of those that its sender may act for."""
@@ -92,6 +105,11 @@ class SiteRooms:
         while not self._rankings.empty():
             self._switch.add_ranking(self._rankings.get(), time.monotonic_ns())
         self._switch.move_waiting(time.monotonic_ns())
+        if time.monotonic() >= self._maps_due_s:
+            self._maps_due_s = time.monotonic() + _MAPS_S
+            self._switch.building.keep(
+                {RoomMap(name, one) for name, room in self._rooms.items() for one in room.maps()}
+            )
 
     def stop(self) -> None:
         """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
@@ -122,7 +140,8 @@ class SiteRooms:
         """Return edge.json of the whole site."""
         reports = {name: room.report() for name, room in self._rooms.items()}
         directory = {"keyframes": len(self._directory), "waiting": self._thread.pending_jobs}
-        return site_report(reports) | {"room_changes": self._switch.changes, "directory": directory}
+        report = site_report(reports, self._switch.building.poses)
+        return report | {"room_changes": self._switch.changes, "directory": directory}
 
     # ------------------------------------------------------------------ what rooms tell
 

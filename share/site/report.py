@@ -6,15 +6,22 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from share.site.building import BuildingPose, RoomMap
+
 _LINES = "refused", "trouble", "degraded", "agent_trouble"
 _BY_NAME = "maps", "objects", "robots"
 _COUNTS = "waiting", "failed_steps", "removed_keyframes", "internal_errors", "forgotten_runs"
 _ROOM_FIELDS = "session", "policy", "loading", "last_solve_s", "loops", "merges", *_COUNTS
 
 
-def site_report(reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def site_report(
+    reports: Mapping[str, Mapping[str, Any]], poses: Mapping[RoomMap, BuildingPose]
+) -> dict[str, Any]:
     """Return one report of all rooms. Agents are those of all rooms, each with its `room`; one that has been
-    in several is reported by the one where it is now. Lines name their room."""
+    in several is reported by the one where it is now. Lines name their room. poses: of maps in the building;
+    a room has that of its largest map."""
     first = next(iter(reports.values()))
     agents = _agents(reports)
     rooms = {
@@ -23,6 +30,7 @@ def site_report(reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
             "agents": sum(agent["room"] == room and not agent["gone"] for agent in agents.values()),
             "keyframes": sum(report.get("maps", {}).values()),
             "maps": len(report.get("maps", {})),
+            **_place(room, report.get("maps", {}), poses),
         }
         for room, report in reports.items()
     }
@@ -47,6 +55,15 @@ def site_report(reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         "version": first["version"],
         "config": first["config"],
     }  # fmt: skip
+
+
+def _place(room: str, maps: Mapping[str, int], poses: Mapping[RoomMap, BuildingPose]) -> dict[str, Any]:
+    """Return `place` of a room in the building; nothing if no agent has walked there from another."""
+    largest = max(maps, key=lambda map_id: maps[map_id], default=None)
+    if largest is None or (pose := poses.get(RoomMap(room, largest))) is None:
+        return {}
+    T = np.round(pose.T_building_map, 6).tolist()
+    return {"place": {"map_id": largest, "in_map_of": pose.reference.room, "T_building_map": T}}
 
 
 def _agents(reports: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

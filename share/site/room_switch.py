@@ -13,6 +13,7 @@ from share.mapping.corrections import MapEvent, map_assignment
 from share.mapping.places import FindKeyframe, FoundPlace, KeyframeSought
 from share.protocol.edge_events import AddKeyframe
 from share.protocol.peer import Peer
+from share.site.building import BuildingGraph, RoomMap
 from share.site.directory import RoomRanking
 from share.site.room_finder import RoomFinder, RoomFound
 from share.timing import seconds_to_ns
@@ -69,12 +70,13 @@ class RoomSwitch:
         self._routes: OrderedDict[bytes, str] = OrderedDict()  # by peer
         self._keyframes: OrderedDict[str, OrderedDict[int, Keyframe]] = OrderedDict()  # newest, by run and id
         self._waiting: dict[str, tuple[RoomFound, int]] = {}  # by run: until when, for its room's disk
+        self.building = BuildingGraph()
         self.changes = 0  # of rooms, since the start
 
     # ------------------------------------------------------------------ routes
 
-    def room_of(self, peer_id: bytes, frames: Sequence[Bytes]) -> str:
-        """Return the room for a message of this peer."""
+    def room_of(self, peer_id: bytes, frames: Sequence[Bytes]) -> str | None:
+        """Return the room for a message of this peer; None for the hello of a name that no room lets in."""
         room = self._routes.get(peer_id)
         if room is not None and self._rooms[room].knows(peer_id) is not None:
             return room
@@ -82,13 +84,16 @@ class RoomSwitch:
             name: count for name, one in self._rooms.items() if (count := one.knows(peer_id)) is not None
         }
         room = max(known, key=lambda name: known[name]) if known else self._room_for_new(frames)
+        if room is None:
+            return None
         self._routes[peer_id] = room
         if len(self._routes) > _MAX_ROUTES:
             self._routes.popitem(last=False)
         return room
 
-    def _room_for_new(self, frames: Sequence[Bytes]) -> str:
-        """Return the room where the name of a hello is present, else the first that it may enter."""
+    def _room_for_new(self, frames: Sequence[Bytes]) -> str | None:
+        """Return the room where the name of a hello is present, else the first that it may enter, if any; the
+        first of all for other messages."""
         rooms = list(self._rooms)
         try:
             message = decode(frames)
@@ -96,9 +101,9 @@ class RoomSwitch:
             return rooms[0]
         if not isinstance(message, Hello | ClientHello):
             return rooms[0]
-        present = [room for room in rooms if self._rooms[room].is_present(message.name)]
         allowed = [room for room in rooms if self._may_enter(room, message.name)]
-        return (present or allowed or rooms)[0]
+        present = [room for room in allowed if self._rooms[room].is_present(message.name)]
+        return next(iter([*present, *allowed]), None)
 
     # ------------------------------------------------------------------ searches
 
@@ -158,8 +163,12 @@ class RoomSwitch:
         if (reason := target.entry_objection(peer)) is not None:
             source.note_refused_entry(peer, found.room, reason)
             return True
+        left, entered = peer.last_correction_event, _entry_event(run, keyframe, found.place)
         peer = source.hand_over(run, found.room)
-        target.take_over(peer, room, _entry_event(run, keyframe, found.place))
+        target.take_over(peer, room, entered)
+        if left is not None and left.correction is not None and entered.correction is not None:
+            maps = RoomMap(room, left.correction.map_id), RoomMap(found.room, found.place.map_id)
+            self.building.add_crossing(maps[0], left.correction, maps[1], entered.correction)
         self._routes[peer.id] = found.room
         self._finder.forget(run)
         self.changes += 1

@@ -85,8 +85,8 @@ class Site(Town):
 
     def to_edge(self, event: ed.EdgeEvent) -> None:
         if isinstance(event, ed.PeerMessageReceived):
-            room = self.rooms[self.switch.room_of(event.peer_id, event.frames)]
-            self.execute(room, room.machine.handle(event, self.now_ns))
+            if (name := self.switch.room_of(event.peer_id, event.frames)) is not None:
+                self.execute(self.rooms[name], self.rooms[name].machine.handle(event, self.now_ns))
         elif isinstance(event, Tick):
             for room in self.rooms.values():
                 self.execute(room, room.machine.handle(event, self.now_ns))

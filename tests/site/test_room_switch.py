@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from helpers.site_sim import Site, T_map_world, Walker
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.common_events import Connected, PrintLine
+from share.site.room_switch import RoomSwitch
+from share.wire.codec import encode
+from share.wire.messages import Bye
 
 KITCHEN, LAB = walls(1), walls(2)
 ONLY_IN_LAB = frozenset({("kitchen", "bob")})  # so that bob begins there
@@ -79,6 +83,19 @@ def test_the_place_in_the_new_map_is_right_at_once(walked):
         assert np.linalg.norm(T[:3, 3]) < 0.15
 
 
+def test_the_door_ties_both_maps(walked):
+    """Ann began at the first place of the kitchen's frame; bob's map has bob's."""
+    ann, bob = (walked.people[walked.peer(name)] for name in ("ann", "bob"))
+    (kitchen, lab) = sorted(walked.switch.building.poses, key=lambda one: one.room)
+    pose = walked.switch.building.poses[lab]
+    assert pose.reference == kitchen
+    T_kitchen_odom = np.eye(4)  # its map is the odom frame in which ann began
+    T_lab_odom = walked.poses("ann")[-1].T_map_odom
+    T = se3.inverse(T_kitchen_odom @ se3.inverse(T_lab_odom)) @ pose.T_building_map
+    assert np.linalg.norm(T[:3, 3]) < 0.3  # odometry drifts meanwhile
+    assert (kitchen.map_id.split("-")[0], lab.map_id.split("-")[0]) == (ann.name, bob.name)
+
+
 def test_odometry_is_what_it_is_without_an_edge(walked):
     ann = walked.people[walked.peer("ann")]
     assert all(
@@ -101,7 +118,7 @@ def test_it_may_come_back():
     assert max(kept["lab"]) < 58  # it looks where it has looked before from some 54 on
     assert site.events("internal error") == site.events("step failed") == []
     maps = [pose.map_id for pose in site.poses("ann")]
-    assert maps[0] == maps[-1]  # the kitchen's
+    assert maps[1] == maps[-1]  # the kitchen's
 
 
 def test_what_is_acknowledged_is_on_a_disk():
@@ -164,3 +181,18 @@ def test_a_switch_asks_nothing_of_a_run_that_has_left():
     before = site.switch.changes
     site.switch.move_waiting(site.now_ns + 10**12 * MS)
     assert site.switch.changes == before
+
+
+def test_a_name_that_no_room_lets_in_has_no_room():
+    site = two_rooms(1)
+    hello = encode(replace(site.people[site.peer("ann")].hello, name="eve", run_id=99))
+    switch = RoomSwitch(site.rooms, lambda room, name: name != "eve")
+    assert switch.room_of(b"12345678", hello) is None
+    assert switch.room_of(b"12345678", [b"\xff"]) == "kitchen"  # which counts it as bad
+    assert switch.room_of(b"12345678", encode(Bye())) == "kitchen"
+
+
+def test_a_second_agent_of_a_name_meets_the_first_in_its_room():
+    site = two_rooms()
+    hello = encode(replace(site.people[site.peer("ann")].hello, run_id=99))
+    assert site.switch.room_of(b"12345678", hello) == "lab"

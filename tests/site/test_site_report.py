@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import numpy as np
+
+from share.site.building import BuildingPose, RoomMap
 from share.site.report import site_plan, site_report
 
 
@@ -17,7 +20,7 @@ def test_an_agent_is_reported_by_the_room_where_it_is():
     here = {"ann": agent(False, keyframes=9), "bob": agent(True, 5.0)}
     before = {"ann": agent(True, 2.0), "bob": agent(True, 60.0), "cy": agent(True, None)}
     for reports in ({"lab": room(here), "hall": room(before)}, {"hall": room(before), "lab": room(here)}):
-        report = site_report(reports)
+        report = site_report(reports, {})
         assert {name: one["room"] for name, one in report["agents"].items()} == {
             "ann": "lab",
             "bob": "lab",
@@ -32,13 +35,16 @@ def test_lines_name_their_room_and_counts_are_added():
         {
             "lab": room({}, trouble=["no disk"], maps={"a/0": 3}, waiting=2, loops={"tried": 4}),
             "hall": room({}, maps={"b/0": 5}, waiting=1, loops={"tried": 1}, loading="loading the map: 9"),
-        }
+        },
+        {RoomMap("lab", "a/0"): BuildingPose(RoomMap("hall", "b/0"), np.eye(4))},
     )
     assert report["trouble"] == ["room 'lab': no disk"]
     assert report["maps"] == {"a/0": 3, "b/0": 5}
     assert report["waiting"] == 3
     assert report["loops"] == {"tried": 5}
     assert report["rooms"]["hall"]["keyframes"] == 5
+    assert report["rooms"]["lab"]["place"]["in_map_of"] == "hall"
+    assert "place" not in report["rooms"]["hall"]
     assert report["loading"] == "hall: loading the map: 9"
 
 
