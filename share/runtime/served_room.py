@@ -19,7 +19,6 @@ from typing import Any, Protocol
 from share.config import Config
 from share.errors import StoreError
 from share.event_kinds import EventKind
-from share.mapping.corrections import MapEvent
 from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
@@ -45,7 +44,7 @@ from share.protocol.edge_events import (
     WriteEvent,
 )
 from share.protocol.edge_records import SessionTotals
-from share.protocol.peer import Peer, RestoredRun
+from share.protocol.peer import RestoredRun
 from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver
@@ -148,7 +147,7 @@ class ServedRoom:
         self._start_session(self._load_stored_map())
 
     def handle(self, event: EdgeEvent) -> None:
-        self._execute_all(self._state_machine.handle(event, time.monotonic_ns()))
+        self.execute(self._state_machine.handle(event, time.monotonic_ns()))
 
     def step(self) -> None:
         """Handle the answers of the room's processes and threads, and the time that has passed."""
@@ -177,43 +176,27 @@ class ServedRoom:
             self._log_map(incomplete_reason)
         return incomplete_reason
 
-    # ------------------------------------------------------------------ runs that change the room
+    # ------------------------------------------------------------------ what other rooms need
 
-    def knows(self, peer_id: bytes) -> int | None:
-        return self._state_machine.knows(peer_id)
+    @property
+    def protocol(self) -> EdgeProtocol:
+        """The state machine of the present session; `execute` carries out what it returns."""
+        return self._state_machine
 
-    def is_present(self, name: str) -> bool:
-        return self._state_machine.is_present(name)
-
-    def run(self, key: str) -> Peer | None:
-        return self._state_machine.run(key)
-
-    def leave_objection(self, key: str) -> str | None:
-        return self._state_machine.leave_objection(key)
-
-    def entry_objection(self, peer: Peer) -> str | None:
-        """Return why a run may not come from another room; None if it may."""
-        if self._restart_due_s is not None:
-            return "its map cannot be read now"
-        return self._state_machine.entry_objection(peer, time.monotonic_ns())
-
-    def hand_over(self, key: str, room: str) -> Peer:
-        """Let a run go on in another room."""
-        peer, effects = self._state_machine.hand_over(key, room, time.monotonic_ns())
-        self._execute_all(effects)
-        return peer
-
-    def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
-        """Take in a run of another room."""
-        self._execute_all(self._state_machine.take_over(peer, room, place, time.monotonic_ns()))
-
-    def note_refused_entry(self, peer: Peer, room: str, reason: str) -> None:
-        self._execute_all(self._state_machine.note_refused_entry(peer, room, reason, time.monotonic_ns()))
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the map cannot be read now, so that nobody may enter."""
+        return self._restart_due_s is not None
 
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe of another room's agent in the map."""
         if self._mapper_process is not None:
             self._mapper_process.send(request)
+
+    def maps(self) -> Mapping[str, int]:
+        """Return the number of keyframes of each map, by the mapper's newest report."""
+        maps: Mapping[str, int] = self._progress.report.get("maps", {})
+        return maps
 
     # ------------------------------------------------------------------ what is shown
 
@@ -224,11 +207,6 @@ class ServedRoom:
     def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of edge.json."""
         return self._blinding.covered_series(self._state_machine.series())
-
-    def maps(self) -> Mapping[str, int]:
-        """Return the number of keyframes of each map, by the mapper's newest report."""
-        maps: Mapping[str, int] = self._progress.report.get("maps", {})
-        return maps
 
     def report(self) -> dict[str, Any]:
         """Return edge.json without `series` and what only the edge around the room knows."""
@@ -358,7 +336,8 @@ class ServedRoom:
                 case _MapNotice() as notice:
                     self._log_map(notice.text)
 
-    def _execute_all(self, effects: Sequence[EdgeEffect]) -> None:
+    def execute(self, effects: Sequence[EdgeEffect]) -> None:
+        """Carry out effects of the state machine."""
         for effect in effects:
             self._execute(effect)
 

@@ -16,16 +16,19 @@ from typing import Any
 
 from share.config import Config
 from share.event_kinds import EventKind
-from share.mapping.places import KeyframeSought, PlaceNews
+from share.mapping.corrections import MapEvent
+from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.edge_events import AddKeyframe, EdgeEvent, PeerMessageReceived
+from share.protocol.peer import Peer
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
+from share.runtime.fault_guard import FaultGuard
 from share.runtime.output_writer import JobThread
 from share.runtime.served_room import RoomHost, ServedRoom
 from share.site.building import RoomMap
 from share.site.directory import PlaceDirectory, RoomRanking
 from share.site.report import site_report
-from share.site.room_switch import RoomSwitch
+from share.site.room_switch import RoomPort, RoomSwitch
 from share.store.map_store import MapStore
 from share.timing import Throttle
 from share.wire.codec import encode
@@ -62,8 +65,10 @@ class SiteRooms:
         self._growing: set[str] = set()
         self._maps_due_s = 0.0  # monotonic
         self._refusals = Throttle(1.0, 5.0)
+        self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
         self._rooms: dict[str, ServedRoom] = {}
-        self._switch = RoomSwitch(self._rooms, lambda room, name: self._setups[room].allows(name))
+        self._ports: dict[str, RoomPort] = {}
+        self._switch = RoomSwitch(self._ports, lambda room, name: self._setups[room].allows(name))
         try:
             for name, setup in self._setups.items():
                 self._rooms[name] = ServedRoom(
@@ -76,6 +81,7 @@ class SiteRooms:
                     has_keys,
                     _Neighbour(name, self),
                 )
+                self._ports[name] = _Port(self._rooms[name])
         except BaseException:
             self.close()
             raise
@@ -102,6 +108,10 @@ class SiteRooms:
         """Handle the answers of all rooms and of the directory, and the time that has passed."""
         for room in self._rooms.values():
             room.step()
+        with self._guard.step("a change of rooms"):
+            self._continue_searches()
+
+    def _continue_searches(self) -> None:
         while not self._rankings.empty():
             self._switch.add_ranking(self._rankings.get(), time.monotonic_ns())
         self._switch.move_waiting(time.monotonic_ns())
@@ -155,7 +165,8 @@ class SiteRooms:
         self._thread.submit(partial(self._update_directory, room, news))
 
     def add_sought(self, room: str, sought: KeyframeSought) -> None:
-        self._switch.add_answer(room, sought, time.monotonic_ns())
+        with self._guard.step("a change of rooms"):
+            self._switch.add_answer(room, sought, time.monotonic_ns())
 
     def expect_growth(self, room: str, is_expected: bool) -> None:
         """Tell the host as long as the map of one room is restored."""
@@ -191,6 +202,45 @@ class _RoomHost:
 
     def log_event(self, event: EventKind, reason: str) -> None:
         self._host.log_event(event, f"room '{self._room}': {reason}")
+
+
+class _Port(RoomPort):
+    """What the switch asks of one room."""
+
+    def __init__(self, room: ServedRoom) -> None:
+        self._room = room
+
+    def knows(self, peer_id: bytes) -> int | None:
+        return self._room.protocol.knows(peer_id)
+
+    def is_present(self, name: str) -> bool:
+        return self._room.protocol.is_present(name)
+
+    def run(self, key: str) -> Peer | None:
+        return self._room.protocol.run(key)
+
+    def leave_objection(self, key: str) -> str | None:
+        return self._room.protocol.leave_objection(key)
+
+    def entry_objection(self, peer: Peer) -> str | None:
+        if self._room.is_waiting:
+            return "its map cannot be read now"
+        return self._room.protocol.entry_objection(peer, time.monotonic_ns())
+
+    def hand_over(self, key: str, room: str) -> Peer:
+        peer, effects = self._room.protocol.hand_over(key, room, time.monotonic_ns())
+        self._room.execute(effects)
+        return peer
+
+    def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
+        self._room.execute(self._room.protocol.take_over(peer, room, place, time.monotonic_ns()))
+
+    def find(self, request: FindKeyframe) -> None:
+        self._room.find(request)
+
+    def note_refused_entry(self, peer: Peer, room: str, reason: str) -> None:
+        effects = self._room.protocol.note_refused_entry(peer, room, reason, time.monotonic_ns())
+        self._room.execute(effects)
 
 
 class _Neighbour:
