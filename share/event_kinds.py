@@ -10,6 +10,7 @@ EventKind = Literal[
     "reconnected",
     "refused",
     "room full",
+    "room changed",
     "connection refused",
     "forgotten",
     "expired",

@@ -18,6 +18,7 @@ COMMANDS = {
     "track": ("share.cli.track", "track", "Track one agent over a recording or camera, without an edge."),
     "agent": ("share.cli.agent", "agent", "Run one agent: track at sensor rate, send keyframes to an edge."),
     "edge": ("share.cli.edge", "edge", "Run the server: merge all agents' maps, send corrections."),
+    "site": ("share.cli.site", "site", "Run the server of several rooms; agents walk between them."),
     "watch": ("share.cli.watch", "watch", "Look at the room of a running edge from a terminal."),
     "dataset": (
         "share.cli.dataset",

@@ -5,21 +5,15 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import click
 
 from share.cli import options
 from share.cli.blind_edge import condition_text, edge_settings
+from share.cli.edge_output import open_map, print_event, print_keys, run_summary
 from share.cli.edge_pages import EdgePages, PageOptions, edge_access
 from share.config import STREAMED
 from share.errors import UsageError
-from share.event_kinds import EventKind
-
-if TYPE_CHECKING:
-    from share.cli.stderr import Stderr
-    from share.net.keys import EdgeKeys
-    from share.store.map_store import MapStore
 
 
 @click.command()
@@ -134,90 +128,15 @@ def edge(
         # before any process starts: the port may be in use
         access = None if headset is None else edge_access(link.endpoint, edge_key_pair, allowed)
         pages = EdgePages(stack, stderr, served, token, access)
-        store = None if map_file is None else stack.enter_context(_open_map(stderr, map_file))
-        on_event = partial(_print_event, stderr, verbose)
+        store = None if map_file is None else stack.enter_context(open_map(stderr, map_file))
+        on_event = partial(print_event, stderr, verbose)
         run = EdgeRun(settings, link, out, on_event, store, pages.observers, allowed, blinding)
         pages.run = stack.enter_context(closing(run))
         with stop_on_signal(run.stop):
             stderr.print_line(f"listening on {link.endpoint}, {condition_text(settings, blinding)}")
-            _print_keys(stderr, edge_key_pair)
+            print_keys(stderr, edge_key_pair)
             if allowed:
                 stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")
             pages.print_addresses()
             report = run.run()
-    click.echo(json.dumps(report) if as_json else _summary(report))
-
-
-def _open_map(stderr: Stderr, path: Path) -> MapStore:
-    """Open the map file; print what it holds and what is damaged. Raises UsageError, ShareError."""
-    from share.store.map_store import MapStore
-
-    store = MapStore.open(path)
-    map_rows = store.rows().tables
-    for complaint in store.problems:
-        stderr.print_line(f"map {path}: {complaint}")
-    if not store.writable:
-        stderr.print_line(
-            f"map {path}: {store.read_only_reason}; it is used as it is, and nothing new is stored"
-        )
-    counts = (
-        f"{len(map_rows['keyframe'])} keyframes of {len(map_rows['run'])} runs, {len(map_rows['loop'])} loops"
-    )
-    stderr.print_line(f"map {path}: {counts}")
-    return store
-
-
-def _print_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
-    if keys is not None:
-        names = ", ".join(sorted(keys.allowed.names_by_key().values()))
-        stderr.print_line(f"public key '{keys.own.public}'; authorized: {names or 'none yet'}")
-
-
-_SHOWN_EVENTS: set[EventKind] = {  # without -v
-    "agent joined",
-    "left",
-    "reconnected",
-    "silent",
-    "expired",
-    "client joined",
-    "client left",
-    "objects moved",
-    "object removed",
-    "robot commanded",
-    "robot answered",
-    "refused",
-    "room full",
-    "connection refused",
-    "maps merged",
-    "merge undone",
-    "step failed",
-    "write failed",
-    "mapper died",
-    "solver died",
-    "odometry suspect",
-    "map",
-    "tracking lost",
-}
-
-
-def _print_event(stderr: Stderr, verbose: bool, event: dict[str, Any]) -> None:
-    if verbose or event["event"] in _SHOWN_EVENTS:
-        agent = f" {event['agent']}:" if event["agent"] else ""
-        stderr.print_line(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}")
-
-
-def _summary(report: dict[str, Any]) -> str:
-    lines = [_agent_summary(name, agent) for name, agent in report["agents"].items()]
-    if loops := report.get("loops"):  # absent until the mapper has reported
-        done = report["merges"]["done"]
-        lines.append(f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {done} merges")
-    return "\n".join(lines)
-
-
-def _agent_summary(name: str, a: dict[str, Any]) -> str:
-    up = f"{a['bytes_up'] / 1e6:.2f} MB up"
-    if "frames_streamed" in a:
-        done = f"{a['frames_tracked']} of {a['frames_streamed']} frames tracked"
-        return f"{name}: {done}, {a['frames_dropped']} dropped, {up}"
-    where = a.get("map_id") or "none yet"
-    return f"{name}: {a['keyframes']} keyframes, {a['corrections']} corrections, {up}, in map {where}"
+    click.echo(json.dumps(report) if as_json else run_summary(report))

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from share.net.transport import Address
     from share.runtime.edge import EdgeRun
     from share.runtime.edge_observer import EdgeObserver
+    from share.runtime.room_plan import RoomPlan
     from share.view.viewer import LiveRoom
     from share.wire.room_messages import Permission
 
@@ -92,8 +93,8 @@ class EdgePages:
     """The status page, the live room and the headset page of an edge, as far as they are asked for. run: set
     once it is made.
 
-    access: of the clients of wearers; None: there is no headset page. Raises UsageError for what is malformed
-    or missing, TransportError for a port in use."""
+    access: of the clients of wearers; None: there is no headset page. rooms: of a site. Raises UsageError for
+    what is malformed or missing, TransportError for a port in use."""
 
     def __init__(
         self,
@@ -102,6 +103,7 @@ class EdgePages:
         served: PageOptions,
         token: str | None,
         access: EdgeAccess | None,
+        rooms: tuple[str, ...] = (),
     ) -> None:
         from share.runtime.room_plan import RoomPlan
         from share.runtime.status_server import StatusServer
@@ -112,12 +114,13 @@ class EdgePages:
         self._stack, self._token_file = stack, served.token_file
         self._stderr, self._addresses, self._is_guarded = stderr, list[str](), token is not None
         self._room: LiveRoom | None = None
+        self._plans: dict[str, RoomPlan] = {}  # by room; "" without rooms
         self._headset: HeadsetPage | None = None
         if served.http is not None:
-            plan = RoomPlan()
-            status = StatusServer(served.http, self._report, stderr.print_line, token, plan.report)
+            status = StatusServer(served.http, self._report, stderr.print_line, token, self._plan)
             stack.callback(status.close)
-            self.observers.append(plan)
+            self._plans = {room: RoomPlan() for room in rooms or ("",)}
+            self.observers += [] if rooms else self._plans.values()
             self._addresses.append(f"status at http://{status.endpoint}/")
         if served.view is not None:
             self._room = LiveRoom(served.view, token, "SHARE edge", stderr.print_line)
@@ -144,6 +147,17 @@ class EdgePages:
         self._addresses.append(f"headset page at {page.url}")
         if page.certificate is not None:
             self._addresses.append(f"its certificate has the SHA-256 {page.certificate.fingerprint}")
+
+    def room_observers(self, room: str) -> list[EdgeObserver]:
+        """Return the observers of one room of a site."""
+        return [self._plans[room]] if room in self._plans else []
+
+    def _plan(self) -> dict[str, Any]:
+        """Return /plan.json."""
+        from share.site.report import site_plan
+
+        reports = {room: plan.report() for room, plan in self._plans.items()}
+        return reports[""] if "" in reports else site_plan(reports, self._report().get("agents", {}))
 
     def _report(self) -> dict[str, Any]:
         """Return the report of the edge, if it runs yet, with what its pages tell that live."""

@@ -17,6 +17,7 @@ from share.mapping.corrections import MapEvent, MapsJoined
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import SaveView
 from share.mapping.mapper_log import MapperLog
+from share.mapping.places import PlaceNewsLog
 from share.mapping.query_queue import QueryQueue
 from share.mapping.recognition.keyframe_views import IndexEntry, KeyframeViews
 from share.mapping.recognition.verification import Refusal, Verification
@@ -41,9 +42,10 @@ class KeyframeLookup:
         queries: QueryQueue,
         hellos: Mapping[str, Hello],
         log: MapperLog,
+        news: PlaceNewsLog | None = None,
     ) -> None:
         self._config, self._atlas, self._views, self._queries = config, atlas, views, queries
-        self._hellos, self._log, self._counters = hellos, log, log.counters
+        self._hellos, self._log, self._counters, self._news = hellos, log, log.counters, news
         self._merge_gate = MergeGate(config.control, config.edge.policy)
         self.revisits = Revisits(atlas.graph)
         self._is_revisit = False  # the keyframe that is looked up was before
@@ -59,7 +61,9 @@ class KeyframeLookup:
         if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
             return  # the map is right here; the keyframe is described when nothing waits
         yield from self.describe(node_id)
-        yield from self._query(node_id, is_aligned, is_placed)
+        is_recognised = yield from self._query(node_id, is_aligned, is_placed)
+        if self._news is not None and not (is_recognised or is_aligned):
+            self._news.add_unrecognised(self._atlas.key(node_id))
 
     def index(self, entries: Sequence[IndexEntry]) -> Job:
         """Index restored keyframes."""
@@ -96,8 +100,9 @@ class KeyframeLookup:
                 is_aligned |= yield from self._check(self._align_step(node_id, candidate), None)
         return is_aligned
 
-    def _query(self, node_id: int, is_aligned: bool, is_placed: bool) -> Job:
-        """Query with a keyframe and check the candidates. is_aligned: see `choose_checks`.
+    def _query(self, node_id: int, is_aligned: bool, is_placed: bool) -> Generator[Any, Any, bool]:
+        """Query with a keyframe and check the candidates. Return whether one of another agent's run, or of
+        the map that its agent shares with others, is verified. is_aligned: see `choose_checks`.
 
         is_placed: the agent does not wait to enter another's map. While it waits, only loops with other
         agents localise it, and they must be found without the map's pose: images that are aligned from a
@@ -105,7 +110,7 @@ class KeyframeLookup:
         """
         views, place = self._views.by_node, self._config.place
         if node_id not in views:
-            return  # removed meanwhile
+            return False  # removed meanwhile
         agent = self._atlas.key(node_id).agent
         excluded = self._not_compared(node_id, is_placed)
         if node_id % _RETRY_INTERVAL:  # agents kept apart are compared now and then: they may agree by now
@@ -113,7 +118,7 @@ class KeyframeLookup:
         found = yield QueryStep(self._views.index, node_id, views[node_id], place.candidates, excluded)
         if node_id not in views:
             yield []
-            return
+            return False
         is_recheck = not is_placed or node_id % _RECHECK_INTERVAL == 0
         known = [candidate.id for candidate in found if candidate.id in views]
         by_map, by_appearance = choose_checks(
@@ -123,14 +128,24 @@ class KeyframeLookup:
             by_appearance = larger_maps_first(self._atlas.graph, by_appearance)
         has_image = self._views.image(node_id) is not None
         yield [] if has_image else self._review_joins(node_id)  # with one, when it was described
-        search = CandidateSearch([*by_map, *by_appearance])
+        search, is_recognised = CandidateSearch([*by_map, *by_appearance]), False
         while (candidate := search.next_candidate(self._queries.has_backlog)) is not None:
             if not {node_id, candidate} <= views.keys():
                 continue  # removed meanwhile
             is_same_map = self._atlas.graph.is_same_map(node_id, candidate)
             if not is_same_map or is_recheck or not self._is_gated(node_id, candidate):
                 make_step = self._align_step if candidate in by_map else self._verify_step
-                yield from self._check(make_step(node_id, candidate), search)
+                is_verified = yield from self._check(make_step(node_id, candidate), search)
+                is_recognised |= is_verified and not self._is_own(node_id, candidate)
+        return is_recognised
+
+    def _is_own(self, node_id: int, candidate: int) -> bool:
+        """Return whether another keyframe is of the same run and in a map that is named after it."""
+        if candidate not in self._views.by_node:
+            return False
+        key = self._atlas.key(candidate)
+        is_same_run = key.agent == self._atlas.key(node_id).agent
+        return is_same_run and self._atlas.map_id(key).startswith(f"{key.agent}/")
 
     def _not_compared(self, node_id: int, is_placed: bool) -> tuple[int, ...]:
         """Return the keyframes that are not compared with this one: those near it on its segment. If its

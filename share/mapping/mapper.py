@@ -21,6 +21,7 @@ from share.mapping.keyframe_removal import RemovedKeyframe
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, SavePoses, StoredMap
 from share.mapping.mapper_log import MapperLog
+from share.mapping.places import KeyframeSearch, PlaceNews, PlaceNewsLog
 from share.mapping.query_queue import QueryQueue, service_kind
 from share.mapping.recognition.keyframe_views import ArchiveReader, KeyframeViews
 from share.mapping.segments import restored_ranks, segment_rank
@@ -32,17 +33,24 @@ from share.wire.messages import Hello
 class Mapper:
     """The maps of all agents. `agent` always names one run of an agent."""
 
-    def __init__(self, config: Config, archive: ArchiveReader | None = None) -> None:
-        """archive: images and views of the keyframes, where a map file keeps them."""
+    def __init__(
+        self, config: Config, archive: ArchiveReader | None = None, news: PlaceNewsLog | None = None
+    ) -> None:
+        """archive: images and views of the keyframes, where a map file keeps them. news: for a directory of
+        places, where there are other rooms."""
         self._config = config
         self._hellos: dict[str, Hello] = {}
-        self.views = KeyframeViews(archive)
+        self._news = news
+        self.views = KeyframeViews(archive, None if news is None else news.add)
         self.atlas = Atlas(config.merge, self.views.by_node)
         self.queries = QueryQueue(config.edge)
         self._publisher = CorrectionPublisher()
         self._log = MapperLog()
         self._counters = self._log.counters
-        self._lookup = KeyframeLookup(config, self.atlas, self.views, self.queries, self._hellos, self._log)
+        self._lookup = KeyframeLookup(
+            config, self.atlas, self.views, self.queries, self._hellos, self._log, news
+        )
+        self.search = KeyframeSearch(self.atlas, self.views, config.place.candidates)
         self._lookup_job, self._solve_job = StepRunner(), StepRunner()
         self._empty_runs: list[KeyframeKey] = []
         self._retention = Retention(config.edge.keep_days)
@@ -118,6 +126,8 @@ class Mapper:
     def _finish_removal(self, removed: Sequence[RemovedKeyframe]) -> None:
         for keyframe in removed:
             self.views.remove(keyframe.node_id)
+            if self._news is not None:
+                self._news.remove(keyframe.key)
             self._retention.remove(keyframe.node_id)
             self._lookup.revisits.remove(keyframe.node_id)
         self._counters.removed_keyframes += len(removed)
@@ -160,6 +170,8 @@ class Mapper:
 
     def _next_job(self) -> Job | None:
         """Next keyframe to look up, or to describe for later queries."""
+        if (search := self.search.next_job()) is not None:
+            return search
         while (node_id := self._next_query()) is not None:
             if node_id in self.views.by_node:
                 return self._lookup.look_up(node_id)
@@ -224,6 +236,17 @@ class Mapper:
     def reset_solver(self) -> None:
         """The solver process lost its state: its next job contains the whole graph."""
         self.atlas.graph.edges.reset()
+
+    # Other rooms
+
+    @property
+    def has_place_answers(self) -> bool:
+        """Whether something for the directory of places waits to be taken."""
+        return self.search.has_answers or (self._news is not None and self._news.has_any)
+
+    def take_place_news(self) -> tuple[PlaceNews, ...]:
+        """Return what a directory of places needs to know since the last call."""
+        return () if self._news is None else self._news.take()
 
     # Results
 

@@ -190,13 +190,27 @@ class RunRegistry(Mapping[bytes, Peer]):
         self._peers[peer.id] = self.by_key[peer.key] = peer
         self.mark_present(peer)
 
-    def restore(self, run: RestoredRun) -> None:
-        """Add a run of an earlier session, which is absent."""
-        peer = run.peer()
+    def restore(self, run: RestoredRun, session: int) -> None:
+        """Add a run of an earlier session, which is absent. session: of the edge."""
+        peer = run.peer(session)
         self.add(peer)
         self.mark_gone(peer)
         if run.odometry_base is None:
             self._empty_runs[run.key] = -1
+
+    def hand_over(self, peer: Peer) -> None:
+        """Leave an absent run in place of one that goes on in another room."""
+        self._remove(peer)
+        self.restore(RestoredRun.from_peer(peer), peer.session)
+
+    def take_over(self, peer: Peer) -> bool:
+        """Add a run that comes from another room. Return whether it was here before."""
+        absent = self.by_key.get(peer.key)
+        if absent is not None:
+            self._remove(absent)
+        self._forgotten_ids.pop(peer.id, None)
+        self.add(peer)
+        return absent is not None
 
     def mark_empty(self, runs: Iterable[KeyframeKey]) -> None:
         """Record that the map has nothing left of these runs. Values: newest keyframes it has seen."""
@@ -215,19 +229,21 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     def forget(self, peer: Peer) -> bool:
         """Remove a run for good. Return whether it was the latest of its name."""
-        del self.by_key[peer.key], self._peers[peer.id]
-        self._present.pop(peer.key, None)
-        self._empty_runs.pop(peer.key, None)
         was_latest = self.is_latest(peer)
-        del self._runs_by_name[peer.name][peer.key]
-        if not self._runs_by_name[peer.name]:
-            del self._runs_by_name[peer.name]
+        self._remove(peer)
+        self._empty_runs.pop(peer.key, None)
         if peer.odometry_base is not None:
             self.forgotten_count += 1
             self._forgotten_ids[peer.id] = None
             if len(self._forgotten_ids) > _MAX_FORGOTTEN:
                 del self._forgotten_ids[next(iter(self._forgotten_ids))]
         return was_latest
+
+    def _remove(self, peer: Peer) -> None:
+        del self.by_key[peer.key], self._peers[peer.id], self._runs_by_name[peer.name][peer.key]
+        self._present.pop(peer.key, None)
+        if not self._runs_by_name[peer.name]:
+            del self._runs_by_name[peer.name]
 
     def was_forgotten(self, peer_id: bytes) -> bool:
         """Return whether this session has forgotten the run, and with it the keyframes that it

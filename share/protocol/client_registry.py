@@ -89,7 +89,7 @@ class ClientRegistry:
     def __init__(self, out: EdgeOutput, silent_s: float) -> None:
         self._out, self._silent_s = out, silent_s
         self._clients: dict[bytes, Client] = {}
-        self._removed: dict[bytes, None] = {}  # for their silence, the oldest first
+        self._removed: dict[bytes, None] = {}  # by `send_away`, the oldest first
         self._new_runs = TokenBuckets(*_NEW_RUN_LIMIT)
         self.requests, self.commands = TokenBuckets(*_REQUEST_LIMIT), TokenBuckets(*_COMMAND_LIMIT)
         self.states = TokenBuckets(*_STATE_LIMIT)
@@ -159,18 +159,22 @@ class ClientRegistry:
         if self._clients.pop(client.id, None) is not None:
             self._out.record("client left", None, f"'{client.name}': {reason}", client=client.name)
 
+    def send_away(self, client: Client, reason: str) -> None:
+        """Remove a client that may think that it is still served."""
+        self.leave(client, reason)
+        self._removed[client.id] = None
+        if len(self._removed) > _MAX_REMOVED:
+            del self._removed[next(iter(self._removed))]
+
     def remove_silent(self) -> None:
         """Remove the clients that have been silent too long."""
         limit_ns = self._out.now_ns - seconds_to_ns(self._silent_s)
         for client in self:
             if client.last_received_ns < limit_ns:
-                self.leave(client, f"no message for {self._silent_s:g} s")
-                self._removed[client.id] = None
-                if len(self._removed) > _MAX_REMOVED:
-                    del self._removed[next(iter(self._removed))]
+                self.send_away(client, f"no message for {self._silent_s:g} s")
 
     def was_removed(self, peer_id: bytes) -> bool:
-        """Return whether a client was removed for its silence. It may think that it is still served."""
+        """Return whether a client was sent away. It may think that it is still served."""
         return peer_id in self._removed
 
 

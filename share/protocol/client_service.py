@@ -78,6 +78,12 @@ class ClientService:
                 reason = f"a {type(message).__name__} which clients must not send"
                 client.count("unexpected", reason, self._out.now_ns)
 
+    def send_away(self, name: str, reason: str) -> None:
+        """Let the clients of an agent that goes on in another room say hello there."""
+        for client in self.clients:
+            if client.name == name:
+                self.clients.send_away(client, reason)
+
     def tick(self) -> None:
         """Do what time makes due."""
         self.clients.remove_silent()

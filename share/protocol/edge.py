@@ -57,7 +57,7 @@ class EdgeProtocol:
     ) -> None:
         self._config, self._session, self._registry = config, session, RunRegistry()
         for run in restored:
-            self._registry.restore(run)
+            self._registry.restore(run, session)
         self.latest_poses = self._registry.latest_poses
         self._out = EdgeOutput(self._registry, has_store, began_ns)
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
@@ -107,6 +107,8 @@ class EdgeProtocol:
                 self.room.mark_saved(event.ticket)
             case Tick():
                 self._membership.check_silence()
+                for map_event in self._membership.end_entries():
+                    self._on_map_event(map_event)
                 self.room.tick()
 
     def _on_internal_error(self, event: ed.EdgeEvent, error: Exception) -> None:
@@ -145,7 +147,9 @@ class EdgeProtocol:
                 self._membership.on_hello(event, message)
             case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 times = message.sent_ns, self._out.now_ns, self._out.now_ns
-                session = _NO_SESSION if self.room.clients.was_removed(event.peer_id) else self._session
+                session = self._session if peer is None else peer.session
+                if self.room.clients.was_removed(event.peer_id):
+                    session = _NO_SESSION
                 self._out.send(event.peer_id, wire.Pong(message.sequence, *times, session))
             case _ if client is not None:
                 self.room.on_message(event, client, message)
@@ -230,14 +234,18 @@ class EdgeProtocol:
 
     def _apply(self, peer: Peer, keyframe: Keyframe) -> None:
         try:
-            keyframe, problem = sanitise(keyframe, peer.odometry_base, peer.hello.rig.cam0)
+            is_entering = peer.entry is not None and peer.entry.is_entering
+            keyframe, problem = sanitise(keyframe, peer.odometry_base, peer.hello.rig.cam0, is_entering)
         except ValueError as error:
             self._out.count_bad_message(peer, str(error))
             return
         if problem:
             self._suspect(peer, problem)
         # a run is stored with its first keyframe
-        run = (SaveRun(peer.key, peer.hello, peer.credential),) if peer.odometry_base is None else ()
+        is_first = peer.odometry_base is None or is_entering
+        run = (SaveRun(peer.key, peer.hello, peer.credential),) if is_first else ()
+        if peer.entry is not None:
+            peer.entry.is_entering = False
         peer.odometry_base = OdometryBase.from_keyframe(keyframe, peer.odometry_base)
         if keyframe.reference < 0:
             self.room.maps.begin_segment(peer.key, keyframe.id)
@@ -257,10 +265,13 @@ class EdgeProtocol:
 
     def _on_map_event(self, map_event: MapEvent) -> None:
         """Record a decision of the mapper, and send its correction if there is one."""
+        peer = None if map_event.agent is None else self._registry.by_key.get(map_event.agent)
+        if peer is not None and peer.entry is not None and peer.entry.withholds(peer.key, map_event):
+            return
         self.room.on_map_event(map_event)
         if map_event.agent is None:
             self._out.record(map_event.event, None, map_event.reason, map_id=map_event.map_id)
-        elif (peer := self._registry.by_key.get(map_event.agent)) is None:
+        elif peer is None:
             return  # forgotten in the meantime
         elif map_event.event == "odometry suspect":
             self._suspect(peer, map_event.reason)
@@ -270,6 +281,56 @@ class EdgeProtocol:
             peer.last_correction_event = map_event
             if not peer.is_gone and peer.is_welcomed:  # else the agent counts it to the earlier session
                 self._out.send_correction(peer, map_event)
+
+    # ------------------------------------------------------------------ runs that change the room
+
+    def knows(self, peer_id: bytes) -> int | None:
+        """Return the number of keyframes that a run of this peer has sent, 0 for a client; None if neither is
+        known."""
+        if (peer := self._registry.get(peer_id)) is not None:
+            return peer.reorder_buffer.next_keyframe
+        return None if self.room.clients.get(peer_id) is None else 0
+
+    def is_present(self, name: str) -> bool:
+        """Return whether a run of this name takes part."""
+        return any(peer.name == name for peer in self._registry.present())
+
+    def run(self, key: str) -> Peer | None:
+        """Return the run of this key; None if it is not known."""
+        return self._registry.by_key.get(key)
+
+    def note_refused_entry(self, peer: Peer, room: str, reason: str, now_ns: int) -> list[ed.EdgeEffect]:
+        """Record that a run may not go on in another room."""
+        self._out.begin(now_ns)
+        self._out.record("room changed", peer, f"stays here: room '{room}' refuses it: {reason}")
+        return self._out.effects
+
+    def leave_objection(self, key: str) -> str | None:
+        """Return why a run cannot go on in another room now; None if it can."""
+        peer = self._registry.by_key.get(key)
+        if peer is None or peer.is_gone:
+            return "it is not here"
+        return "keyframes wait for the disk" if peer.pending_saves else None
+
+    def entry_objection(self, peer: Peer, now_ns: int) -> str | None:
+        """Return why a run may not come from another room; None if it may."""
+        self._out.begin(now_ns)
+        return self._membership.entry_objection(peer)
+
+    def hand_over(self, key: str, room: str, now_ns: int) -> tuple[Peer, list[ed.EdgeEffect]]:
+        """Let a run go on in another room; `leave_objection` has none. Return it, and the effects here."""
+        self._out.begin(now_ns)
+        peer = self._registry.by_key[key]
+        self._membership.hand_over(peer, room)
+        return peer, self._out.effects
+
+    def take_over(self, peer: Peer, room: str, place: MapEvent, now_ns: int) -> list[ed.EdgeEffect]:
+        """Take in a run that leaves another room; `entry_objection` has none. place: where it was found in a
+        map of this room, which it is shown at once. Its next keyframe starts a segment."""
+        self._out.begin(now_ns)
+        self._membership.take_over(peer, room)
+        self._on_map_event(place)
+        return self._out.effects
 
     # ------------------------------------------------------------------ reports
 

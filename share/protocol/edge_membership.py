@@ -7,17 +7,20 @@ from collections.abc import Sequence
 from share.config import Config
 from share.event_kinds import EventKind
 from share.geometry.camera import Rig
+from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import RemoveRun, SaveCredential
 from share.protocol import edge_events as ed
 from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
 from share.protocol.client_service import ClientService
 from share.protocol.edge_records import EdgeOutput
-from share.protocol.peer import Peer
+from share.protocol.peer import Peer, RoomEntry
 from share.scheduling.rate_scheduler import RateScheduler
 from share.scheduling.room_budget import RateGrant
 from share.timing import seconds_to_ns
 from share.wire import messages as wire
 from share.wire.codec import WIRE_VERSION
+
+_ENTRY_S = 5.0  # in which a run that has come from another room enters a map of this one
 
 
 class RunTrackers:
@@ -98,7 +101,7 @@ class RoomMembership:
         self._admission.record_join(event, hello, self._out.now_ns)
         self._supersede(hello.name)
         key = new_run_key(hello, self._registry.by_key)
-        peer = Peer(event.peer_id, hello, key, self._out.now_ns, credential=event.credential)
+        peer = Peer(event.peer_id, hello, key, self._out.now_ns, self._session, credential=event.credential)
         self._registry.add(peer)
         self._out.add(ed.AddRun(peer.key, peer.hello, event.credential))
         self._rate_scheduler.begin_run(peer.name)
@@ -119,7 +122,7 @@ class RoomMembership:
         if not self._trackers.is_ready(peer.key):
             return
         peer.is_welcomed, hold_ms = True, self._rate_scheduler.policy.hold_ms(peer.name, self._out.now_ns)
-        self._out.send(peer.id, wire.Welcome(self._session, peer.durable_below, hold_ms))
+        self._out.send(peer.id, wire.Welcome(peer.session, peer.durable_below, hold_ms))
         peer.grant = None
         first = self._rate_scheduler.policy.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
         self.send_grant(peer, first)
@@ -151,6 +154,50 @@ class RoomMembership:
         self._out.record("reconnected", peer, "sends again")
         self._make_room(peer)
         self._out.add(*self._trackers.start(peer.key))
+
+    # ------------------------------------------------------------ runs that change the room
+
+    def hand_over(self, peer: Peer, room: str) -> None:
+        """Let a present run whose keyframes are all stored go on in another room."""
+        self._registry.hand_over(peer)
+        self._room.send_away(peer.name, f"its agent goes on in room '{room}'")
+        self._rate_scheduler.forget(peer.name)
+        self._out.add(ed.SetPresence(peer.key, False))
+        self._out.record("room changed", peer, f"goes on in room '{room}'")
+
+    def entry_objection(self, peer: Peer) -> str | None:
+        """Return why a run may not come from another room; None if it may."""
+        known = self._registry.by_key.get(peer.key)
+        if known is not None and known.id != peer.id:
+            return f"another run is called {peer.key} there"
+        return self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
+
+    def take_over(self, peer: Peer, room: str) -> None:
+        """Take in a run from another room; nothing objects."""
+        peer.entry, peer.grant = RoomEntry(self._out.now_ns + seconds_to_ns(_ENTRY_S)), None
+        was_here = self._registry.take_over(peer)
+        change = (
+            ed.SetPresence(peer.key, True)
+            if was_here
+            else ed.AddRun(peer.key, peer.hello, peer.credential or "")
+        )
+        self._out.add(change)
+        self._rate_scheduler.begin_run(peer.name)
+        self._out.record("room changed", peer, f"comes from room '{room}'")
+        self._make_room(peer)
+        first = self._rate_scheduler.policy.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
+        self.send_grant(peer, first)
+
+    def end_entries(self) -> list[MapEvent]:
+        """Return the withheld corrections of runs that entered some time ago and are in a map of their
+        own."""
+        out = []
+        for peer in self._registry.present():
+            entry = peer.entry
+            if entry is not None and not entry.is_entering and self._out.now_ns >= entry.until_ns:
+                out += [] if entry.withheld is None else [entry.withheld]
+                peer.entry = None
+        return out
 
     def _supersede(self, name: str) -> None:
         """Mark present runs of this name as gone: they were silent too long, and a new run takes it."""

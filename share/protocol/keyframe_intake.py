@@ -200,11 +200,14 @@ class OdometryBase:
         return f"its motion and its two poses differ by {mismatch_m:.2g} m and {mismatch_deg:.2g} degrees"
 
 
-def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> tuple[Keyframe, str | None]:
+def sanitise(
+    keyframe: Keyframe, base: OdometryBase | None, camera: Camera, is_entering: bool = False
+) -> tuple[Keyframe, str | None]:
     """Return the next keyframe of a run as the map accepts it, and what was wrong with it, None if nothing.
 
-    base: the run's keyframe before; camera: its cam0. A keyframe with an implausible jump, or with a motion
-    that contradicts its two poses, starts a segment in the same odom. Poses relative to earlier keyframes
+    base: the run's keyframe before; camera: its cam0. is_entering: the keyframe before is in another room. A
+    keyframe with an implausible jump, or with a motion that contradicts its two poses, starts a segment in
+    the same odom, as does one that enters. Poses relative to earlier keyframes
     that contradict its steps are dropped, as is an image that cannot be this camera's. An excessive
     covariance is bounded. Raises ValueError if its reference is not `base`.
     """
@@ -215,8 +218,10 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
     if keyframe.reference >= 0:
         if base is None or keyframe.reference != base.id:
             raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, not to the last one")
-        if reason := _segment_reason(keyframe, base):
+        reason = _segment_reason(keyframe, base)
+        if reason is not None:
             problems.append(f"{reason}: new segment")
+        if reason is not None or is_entering:
             earlier = EarlierPoses.empty()
             keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=earlier)
         else:

@@ -130,16 +130,36 @@ class Sender:
         return self.counts[kind]
 
 
+@dataclass
+class RoomEntry:
+    """What is left to do for a run that has come from another room. is_entering: none of its keyframes is in
+    this room's map yet. Until `until_ns` it is shown where it was found in a map of this room; withheld: the
+    newest correction into a map of its own."""
+
+    until_ns: int
+    is_entering: bool = True
+    withheld: MapEvent | None = None
+
+    def withholds(self, key: str, map_event: MapEvent) -> bool:
+        """Return whether this event of run `key` is not for its agent yet, and keep it."""
+        if map_event.correction is None:
+            return False
+        is_own = map_event.correction.map_id.startswith(f"{key}/")
+        self.withheld = map_event if is_own else None
+        return is_own
+
+
 @dataclass(eq=False)
 class Peer(Sender):
-    """A run of an agent. id: of the transport. durable_below: keyframes below this id are stored, and so
-    acknowledged. pending_saves: number of keyframes applied but not stored yet. odometry_base: the newest
-    applied keyframe. credential: as in `SaveRun`."""
+    """A run of an agent. id: of the transport. session: the number that its agent knows this edge by.
+    durable_below: keyframes below this id are stored, and so acknowledged. pending_saves: number of keyframes
+    applied but not stored yet. odometry_base: the newest applied keyframe. credential: as in `SaveRun`."""
 
     id: bytes
     hello: Hello
     key: str  # `new_run_key`
     last_received_ns: int
+    session: int
     reorder_buffer: ReorderBuffer = field(default_factory=ReorderBuffer)
     durable_below: int = 0
     odometry_base: OdometryBase | None = None
@@ -158,6 +178,7 @@ class Peer(Sender):
     grant: RateGrant | None = None  # the last that was sent
     computation: ComputationDelay = field(default_factory=ComputationDelay)
     credential: str | None = ""
+    entry: RoomEntry | None = None  # of a run that has come from another room
     since_last_ns: int = 0  # from the message before the newest until that; 0: there was none
     arrival_ms: float = 0.0  # `since_last_ns` of its newest keyframe: how long that took to arrive, at most
 
@@ -256,13 +277,19 @@ class RestoredRun:
         """Id of the keyframe that the edge asks for."""
         return 0 if self.odometry_base is None else self.odometry_base.id + 1
 
-    def peer(self) -> Peer:
-        """Return the absent run, which may resume where it was."""
+    @classmethod
+    def from_peer(cls, peer: Peer) -> RestoredRun:
+        """Return a run as it is now: its keyframes are all stored."""
+        return cls(peer.key, peer.hello, peer.odometry_base, peer.last_correction_event, peer.credential)
+
+    def peer(self, session: int) -> Peer:
+        """Return the absent run, which may resume where it was. session: of the edge."""
         return Peer(
             id=peer_id(self.hello.run_id),
             hello=self.hello,
             key=self.key,
             last_received_ns=0,
+            session=session,
             reorder_buffer=ReorderBuffer(self.next_keyframe),
             durable_below=self.next_keyframe,
             odometry_base=self.odometry_base,

@@ -1,6 +1,6 @@
 """The edge process: one receive loop that never computes and never waits for a disk.
 
-link -> ServedRoom (share.runtime.served_room) -> link
+link -> ServedRoom (share.runtime.served_room), or several (share.runtime.site_rooms) -> link
                                                -> output writer thread (share.runtime.output_writer)
                                                   -> events.jsonl, edge.json
 """
@@ -24,6 +24,7 @@ from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.fault_guard import FaultGuard
 from share.runtime.run_files import EdgeFiles
 from share.runtime.served_room import ServedRoom
+from share.runtime.site_rooms import RoomSetup, SiteRooms
 from share.startup import HeapTrimmer
 from share.store.map_store import MapStore
 from share.wire.layouts import Bytes
@@ -51,7 +52,10 @@ class EdgeRun:
         observers: Sequence[EdgeObserver] = (),
         allowed: Collection[Permission] = (),
         blinding: Blinding | None = None,
+        rooms: Sequence[RoomSetup] = (),
     ) -> None:
+        """rooms: of a site, each with what is its own; then `settings`, `store` and `blinding` are of none.
+        Raises StoreError if a map is unreadable."""
         self._allowed, self._link, self._on_record = frozenset(allowed), link, on_record
         self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
@@ -66,9 +70,14 @@ class EdgeRun:
         self._heap = HeapTrimmer()
         self._guard = FaultGuard(lambda text: self.log_event("internal error", text))
         has_keys = link.agent_names("") is not None
-        self._room = ServedRoom(
-            settings, self, self._start_ns, store, self._observer, blinding or NoBlinding(), has_keys
-        )
+        self._has_observers = bool(observers or rooms)
+        self._room: ServedRoom | SiteRooms
+        if rooms:
+            self._room = SiteRooms(self, rooms, self._start_ns, has_keys)
+        else:
+            self._room = ServedRoom(
+                settings, self, self._start_ns, store, self._observer, blinding or NoBlinding(), has_keys
+            )
 
     def stop(self) -> None:
         """End the run. Safe from any thread and from a signal handler."""
@@ -152,9 +161,9 @@ class EdgeRun:
 
     def _show_state(self, now_s: float, has_news: bool) -> None:
         """Show poses and report to the observer, where due; poses as soon as messages have come, too."""
-        if self._observer.has_any and (has_news or now_s - self._poses_shown_s >= _POSES_SHOWN_S):
+        if self._has_observers and (has_news or now_s - self._poses_shown_s >= _POSES_SHOWN_S):
             self._poses_shown_s = now_s
-            self._observer.add_poses(self._room.latest_poses())
+            self._room.show_poses()
         if now_s - self._report_shown_s >= _REPORT_SHOWN_S:
             self._report_shown_s = now_s
             self._observer.add_report(self._report)

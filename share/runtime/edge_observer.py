@@ -32,7 +32,7 @@ class EdgeObservers(EdgeObserver):
     """Shows all of some observers, perhaps none, what happens."""
 
     def __init__(self, *observers: EdgeObserver) -> None:
-        self._observers, self.has_any = observers, bool(observers)
+        self._observers = observers
 
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         for one in self._observers:

@@ -15,6 +15,7 @@ from share.mapping.corrections import MapEvent
 from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.map_changes import StoredMap, with_unknown_credentials
 from share.mapping.mapper import Mapper
+from share.mapping.places import FindKeyframe, PlaceNews, PlaceNewsLog
 from share.mapping.steps import SolveStep
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult, SetCredential, SetPresence
 from share.protocol.keyframe_intake import FairQueue
@@ -58,6 +59,13 @@ class MapperReport:
     solving_s: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class PlaceNewsBatch:
+    """What a directory of places needs to know of the map."""
+
+    news: tuple[PlaceNews, ...]
+
+
 @dataclass(frozen=True)
 class MapRestored:
     """All of `RestoreMap` is restored: a later death is not caused by the file's contents."""
@@ -84,12 +92,18 @@ class _SolveResult:
 
 
 def run_mapper(
-    inbox: Inbox, answer: Callable[[Any], None], settings: Config, map_file: Path | None = None
+    inbox: Inbox,
+    answer: Callable[[Any], None],
+    settings: Config,
+    map_file: Path | None = None,
+    has_other_rooms: bool = False,
 ) -> None:
-    """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe and
-    DropRun until END; answers KeyframesAdded, MapperResult, MapperReport, MapRestored and SolverDied.
-    map_file: where images and views are read."""
-    _MapperProcess(inbox, answer, settings, None if map_file is None else KeyframeArchive(map_file)).run()
+    """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe, DropRun
+    and FindKeyframe until END; answers KeyframesAdded, MapperResult, MapperReport, MapRestored, SolverDied
+    and KeyframeSought, and where there are other rooms PlaceNewsBatch. map_file: where images and views are
+    read."""
+    archive = None if map_file is None else KeyframeArchive(map_file)
+    _MapperProcess(inbox, answer, settings, archive, PlaceNewsLog() if has_other_rooms else None).run()
 
 
 class _MapperProcess:
@@ -99,9 +113,10 @@ class _MapperProcess:
         answer: Callable[[Any], None],
         settings: Config,
         archive: KeyframeArchive | None,
+        news: PlaceNewsLog | None,
     ) -> None:
         self._inbox, self._answer, self._settings = inbox, answer, settings
-        self._mapper = Mapper(settings, archive)
+        self._mapper = Mapper(settings, archive, news)
         self._backoff = Backoff(time.monotonic_ns())
         self._solver = self._new_solver(0.0)
         self._is_restoring = False
@@ -129,7 +144,8 @@ class _MapperProcess:
     def _loop(self) -> None:
         step = None
         while not self._is_ended:
-            for message in self._receive(wait=step is None and not self._keyframe_queue):
+            has_work = step is not None or self._keyframe_queue or self._mapper.has_place_answers
+            for message in self._receive(wait=not has_work):
                 self._handle(message)
             self._expire()
             self._add_keyframes()
@@ -166,6 +182,8 @@ class _MapperProcess:
                 self._guarded("forget", partial(self._mapper.remove_run, message.key), None)
             case AddKeyframe():
                 self._keyframe_queue.add(self._mapper.agent_name(message.key), message)
+            case FindKeyframe():
+                self._mapper.search.add(message)
             case _SolveResult():
                 self._finish_solve(message.result, message.ms)
             case _SolverProcessDied():
@@ -231,6 +249,10 @@ class _MapperProcess:
         self._finish_solve(RuntimeError(f"the solver {reason}"), 0.0)
 
     def _publish(self) -> None:
+        for answer in self._mapper.search.take_answers():
+            self._answer(answer)
+        if news := self._mapper.take_place_news():
+            self._answer(PlaceNewsBatch(news))
         changes = self._mapper.take_changes()
         if self._has_new_poses and time.monotonic() >= self._poses_due_s:
             self._has_new_poses, self._poses_due_s = False, time.monotonic() + _SAVE_POSES_S

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from share.config import Config
 from share.errors import StoreError
 from share.event_kinds import EventKind
+from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
 from share.protocol.edge import EdgeProtocol
@@ -49,14 +50,20 @@ from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
 from share.runtime.map_writer import MapWriter
-from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap, SolverDied, run_mapper
+from share.runtime.mapper_process import (
+    MapperReport,
+    MapRestored,
+    PlaceNewsBatch,
+    RestoreMap,
+    SolverDied,
+    run_mapper,
+)
 from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
 from share.runtime.worker_process import WorkerProcess
 from share.scheduling.policies import POLICIES
 from share.store.map_store import MapStore
 from share.wire.layouts import Bytes
-from share.wire.messages import PoseUpdate
 
 _DRAIN_S = 0.5  # wait for the map writer of a session that is over
 
@@ -77,6 +84,22 @@ class RoomHost(Protocol):
 
     def log_event(self, event: EventKind, reason: str) -> None:
         """Log what happens to the room's processes and files."""
+
+
+class OtherRooms(Protocol):
+    """What a room tells of itself where there are others. All is called from the edge's loop."""
+
+    def note_session(self) -> None:
+        """The room's map begins anew, with what its file holds."""
+
+    def note_keyframe(self, added: AddKeyframe) -> None:
+        """A keyframe goes to the mapper."""
+
+    def note_places(self, news: Sequence[PlaceNews]) -> None:
+        """The map has changed, or has not recognised a keyframe."""
+
+    def note_sought(self, sought: KeyframeSought) -> None:
+        """The answer to `ServedRoom.find`."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +132,10 @@ class ServedRoom:
         observer: EdgeObserver,
         blinding: Blinding | NoBlinding,
         has_keys: bool,
+        others: OtherRooms | None = None,
     ) -> None:
         self._settings, self._host, self._start_ns = settings, host, start_ns
-        self._observer, self._blinding = observer, blinding
+        self._observer, self._blinding, self._others = observer, blinding, others
         self._restarts = MapperRestarts(store, settings.merge.enter_m, self._log_map, has_keys)
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
         self._restart_reason = ""
@@ -123,8 +147,7 @@ class ServedRoom:
         self._start_session(self._load_stored_map())
 
     def handle(self, event: EdgeEvent) -> None:
-        for effect in self._state_machine.handle(event, time.monotonic_ns()):
-            self._execute(effect)
+        self.execute(self._state_machine.handle(event, time.monotonic_ns()))
 
     def step(self) -> None:
         """Handle the answers of the room's processes and threads, and the time that has passed."""
@@ -153,11 +176,33 @@ class ServedRoom:
             self._log_map(incomplete_reason)
         return incomplete_reason
 
+    # ------------------------------------------------------------------ what other rooms need
+
+    @property
+    def protocol(self) -> EdgeProtocol:
+        """The state machine of the present session; `execute` carries out what it returns."""
+        return self._state_machine
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the map cannot be read now, so that nobody may enter."""
+        return self._restart_due_s is not None
+
+    def find(self, request: FindKeyframe) -> None:
+        """Search a keyframe of another room's agent in the map."""
+        if self._mapper_process is not None:
+            self._mapper_process.send(request)
+
+    def maps(self) -> Mapping[str, int]:
+        """Return the number of keyframes of each map, by the mapper's newest report."""
+        maps: Mapping[str, int] = self._progress.report.get("maps", {})
+        return maps
+
     # ------------------------------------------------------------------ what is shown
 
-    def latest_poses(self) -> dict[str, PoseUpdate]:
-        """Return the newest pose of each present run, by run key."""
-        return self._state_machine.latest_poses()
+    def show_poses(self) -> None:
+        """Show the observer the newest pose of each present run."""
+        self._observer.add_poses(self._state_machine.latest_poses())
 
     def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of edge.json."""
@@ -216,7 +261,10 @@ class ServedRoom:
         store, writable = self._restarts.store, self._restarts.writable
         session, objects = secrets.randbits(63), self._restarts.objects or ()
         self._state_machine = EdgeProtocol(self._settings, session, writable, known, self._start_ns, objects)
-        arguments = (self._settings, None if store is None else store.path)
+        if self._others is not None:
+            self._others.note_session()
+        has_others = self._others is not None
+        arguments = (self._settings, None if store is None else store.path, has_others)
         self._mapper_process = WorkerProcess(
             "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
         )
@@ -266,6 +314,10 @@ class ServedRoom:
                     self._handover.record_added(added)
                 case MapperReport() as report:
                     self._progress.record(report)
+                case PlaceNewsBatch() as batch if self._others is not None:
+                    self._others.note_places(batch.news)
+                case KeyframeSought() as sought if self._others is not None:
+                    self._others.note_sought(sought)
                 case _MapNotice() as notice:
                     self._log_map(notice.text)
                 case MapRestored():
@@ -284,6 +336,11 @@ class ServedRoom:
                 case _MapNotice() as notice:
                     self._log_map(notice.text)
 
+    def execute(self, effects: Sequence[EdgeEffect]) -> None:
+        """Carry out effects of the state machine."""
+        for effect in effects:
+            self._execute(effect)
+
     def _execute(self, effect: EdgeEffect) -> None:
         if isinstance(effect, WriteEvent):
             fields = self._blinding.covered_event(effect.fields)
@@ -296,6 +353,8 @@ class ServedRoom:
                 self._host.send(effect.peer_id, effect.frames)
             case AddKeyframe() if self._mapper_process is not None:
                 self._handover.add(effect)
+                if self._others is not None:
+                    self._others.note_keyframe(effect)
             case AddRun() | SetCredential() | SetPresence() | DropRun() if self._mapper_process is not None:
                 self._mapper_process.send(effect)
             case StartTracker() | TrackFrame() | StopTracker():

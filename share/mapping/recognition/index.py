@@ -98,20 +98,24 @@ class PlaceIndex:
 
         A shared word scores log(n / df).
         """
-        if not len(self) or not len(descriptors):
+        return self.query_words(self.words(descriptors), limit, exclude) if len(descriptors) else []
+
+    def query_words(self, words: U32, limit: int, exclude: Collection[int] = ()) -> list[PlaceCandidate]:
+        """As `query`, with the words (N,) of the descriptors."""
+        if not len(self):
             return []
-        words, weights = self._weight_words(descriptors)
-        parts = [(page.ids, page.sizes, page.votes(words, weights)) for page in self._pages]
-        parts.append(self._unpaged_votes(words, weights))
+        distinct, weights = self._weight_words(words)
+        parts = [(page.ids, page.sizes, page.votes(distinct, weights)) for page in self._pages]
+        parts.append(self._unpaged_votes(distinct, weights))
         ids, sizes, votes = (np.concatenate(column) for column in zip(*parts, strict=True))
         scores = votes / np.sqrt(np.maximum(1, sizes))
         scores[np.isin(ids, list(exclude))] = 0.0
         ranked = _best(scores, limit)
         return [PlaceCandidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
 
-    def _weight_words(self, descriptors: U8) -> tuple[I64, F64]:
-        """Distinct words of the view within the budget of entries, and their weights."""
-        words, term_counts = np.unique(self.words(descriptors).astype(np.int64), return_counts=True)
+    def _weight_words(self, view_words: U32) -> tuple[I64, F64]:
+        """Distinct words of a view within the budget of entries, and their weights."""
+        words, term_counts = np.unique(view_words.astype(np.int64), return_counts=True)
         word_counts = self._word_counts[words]
         rare_first = np.argsort(word_counts, kind="stable")
         n = len(self)

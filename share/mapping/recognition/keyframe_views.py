@@ -66,8 +66,14 @@ class KeyframeViews:
     archive: what is in it is forgotten here once it was not used for long.
     """
 
-    def __init__(self, archive: ArchiveReader | None = None) -> None:
+    def __init__(
+        self,
+        archive: ArchiveReader | None = None,
+        on_indexed: Callable[[KeyframeKey, U32], None] | None = None,
+    ) -> None:
+        """on_indexed: called with each keyframe that is described, and the words of its descriptors."""
         self.index = PlaceIndex()
+        self._on_indexed = on_indexed
         self._archive = archive
         self._known: dict[int, _ResidentKeyframe] = {}
         self.by_node: Mapping[int, CameraView] = _LazyViews(self._known, self._camera_view)
@@ -129,6 +135,8 @@ class KeyframeViews:
     def _add_to_index(self, node_id: int, words: U32) -> None:
         self._indexed.add(node_id)
         self.index.add_words(node_id, words)
+        if self._on_indexed is not None:
+            self._on_indexed(self._known[node_id].key, words)
 
     # Images
 

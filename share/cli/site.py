@@ -1,0 +1,137 @@
+"""`share site`: run the server of several rooms."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli import options
+from share.config import STREAMED
+from share.errors import UsageError
+
+if TYPE_CHECKING:
+    from contextlib import ExitStack
+
+    from share.cli.edge_pages import EdgePages
+    from share.cli.stderr import Stderr
+    from share.config import Config
+    from share.runtime.site_rooms import RoomSetup
+    from share.site.rooms_file import SitePlan
+
+
+@click.command()
+@click.option(
+    "--rooms", "rooms_file", metavar="FILE", type=options.PATH, required=True, help="The rooms, see above."
+)
+@click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
+@options.policy
+@options.keys
+@click.option(
+    "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
+)
+@click.option(
+    "--http-token",
+    metavar="FILE",
+    type=options.PATH,
+    help="Ask for the token in this file, made if it is not there; needed to serve other machines.",
+)
+@click.option(
+    "--allow",
+    "allow",
+    type=click.Choice(["commands", "objects"]),
+    multiple=True,
+    help="Without keys: what all on this machine may do: commands (send robots), objects (place them). "
+    "May be repeated.",
+)
+@click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
+@options.config
+@options.verbose
+@options.as_json
+def site(
+    rooms_file: Path,
+    bind: str,
+    policy: str | None,
+    keys: Path | None,
+    http: str | None,
+    http_token: Path | None,
+    allow: tuple[str, ...],
+    out: Path | None,
+    config_file: Path | None,
+    verbose: bool,
+    as_json: bool,
+) -> None:
+    """Serve several rooms at one address, each with a map of its own, until Ctrl-C.
+
+    An agent begins in the room where it was last, else in the first that it may enter. Whoever walks into
+    another room is found there by what its camera sees, and goes on in that room's map; the agent does not
+    reconnect, and loses no keyframe.
+
+    \b
+    A rooms file, in YAML:
+      rooms:
+        kitchen: {map: kitchen.sqlite}
+        lab: {map: lab.sqlite, agents: [ann, bob], max_agents: 8, max_keyframes: 2000}
+        hall:
+
+    map: file of the room's map, relative to the rooms file; without it the map is not kept. agents: names
+    that may enter the room. max_agents and max_keyframes: its limits, as edge.max_agents and
+    edge.max_keyframes of --config.
+
+    \b
+    Example:  share site --rooms rooms.yaml --http 8080
+    """
+    from contextlib import ExitStack, closing
+
+    from share.cli.edge_output import print_event, print_keys, run_summary
+    from share.cli.edge_pages import EdgePages, PageOptions
+    from share.cli.stderr import Stderr
+    from share.net.keys import allowed_without_keys, edge_keys_for
+    from share.net.transport import bind as bind_link
+    from share.net.transport import parse_address
+    from share.runtime.edge import EdgeRun
+    from share.runtime.signals import stop_on_signal
+    from share.site.rooms_file import read_rooms
+    from share.wire.layouts import MAX_FRAME_BYTES
+
+    settings = options.load_config(config_file, [policy])
+    if settings.edge.policy == STREAMED:
+        raise UsageError("policy streamed builds no map, so nobody can be found in a room; choose another")
+    plan = read_rooms(rooms_file)
+    key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
+    allowed = allowed_without_keys(allow, key_pair is not None)
+    served = PageOptions(http, None, None, None, None, (), http_token, out)
+    token = served.check(bind, False)
+    with ExitStack() as stack:
+        stderr = stack.enter_context(closing(Stderr()))
+        link = stack.enter_context(closing(bind_link(bind, key_pair, MAX_FRAME_BYTES)))
+        pages = EdgePages(stack, stderr, served, token, None, tuple(plan.rooms))
+        rooms = [_room_setup(stack, stderr, plan, name, settings, pages) for name in plan.rooms]
+        on_event = partial(print_event, stderr, verbose)
+        run = EdgeRun(settings, link, out, on_event, allowed=allowed, rooms=rooms)
+        pages.run = stack.enter_context(closing(run))
+        with stop_on_signal(run.stop):
+            names = ", ".join(f"'{name}'" for name in plan.rooms)
+            stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}, rooms {names}")
+            print_keys(stderr, key_pair)
+            pages.print_addresses()
+            report = run.run()
+    click.echo(json.dumps(report) if as_json else run_summary(report))
+
+
+def _room_setup(
+    stack: ExitStack, stderr: Stderr, plan: SitePlan, room: str, settings: Config, pages: EdgePages
+) -> RoomSetup:
+    """Return one room, with its map opened. Raises ConfigError, UsageError, ShareError."""
+    from share.cli.edge_output import open_map
+    from share.runtime.edge_observer import EdgeObservers
+    from share.runtime.site_rooms import RoomSetup
+
+    one, map_file = plan.rooms[room], plan.map_file(room)
+    store = None if map_file is None else stack.enter_context(open_map(stderr, map_file))
+    names = None if one.agents is None else frozenset(one.agents)
+    observer = EdgeObservers(*pages.room_observers(room))
+    return RoomSetup(room, one.settings(settings), store, observer, names)

@@ -1,0 +1,262 @@
+"""The rooms of a site behind one front, each with its state machine, mapper and map file, and the directory
+of places that finds an agent's room.
+
+host (share.runtime.edge) -> RoomSwitch -> ServedRoom of each room -> host
+    -> directory thread (share.site.directory) -> rankings -> RoomSwitch
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from share.config import Config
+from share.event_kinds import EventKind
+from share.mapping.corrections import MapEvent
+from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
+from share.protocol.edge_events import AddKeyframe, EdgeEvent, PeerMessageReceived
+from share.protocol.peer import Peer
+from share.runtime.blinding import NoBlinding
+from share.runtime.edge_observer import EdgeObserver
+from share.runtime.fault_guard import FaultGuard
+from share.runtime.output_writer import JobThread
+from share.runtime.served_room import RoomHost, ServedRoom
+from share.site.building import RoomMap
+from share.site.directory import PlaceDirectory, RoomRanking
+from share.site.report import site_report
+from share.site.room_switch import RoomPort, RoomSwitch
+from share.store.map_store import MapStore
+from share.timing import Throttle
+from share.wire.codec import encode
+from share.wire.layouts import Bytes
+from share.wire.messages import Refused
+
+_NO_ROOM = "no room of this site lets this name in: add it to `agents` of one in the rooms file"
+_MAPS_S = 5.0  # period in which the building's graph forgets maps that are gone
+_TIMEOUT_S = 5.0  # for the directory's thread at the end
+
+
+@dataclass(frozen=True, eq=False)
+class RoomSetup:
+    """One room of a site. names: of the agents that may be in it; None: all."""
+
+    name: str
+    settings: Config
+    store: MapStore | None
+    observer: EdgeObserver
+    names: frozenset[str] | None = None
+
+    def allows(self, name: str) -> bool:
+        return self.names is None or name in self.names
+
+
+class SiteRooms:
+    """The rooms of a site, until `close`; has the interface of one `ServedRoom`. Those of whom nothing is
+    known begin in the first room. Raises StoreError if the map of a room is unreadable."""
+
+    def __init__(self, host: RoomHost, setups: Sequence[RoomSetup], start_ns: int, has_keys: bool) -> None:
+        self._host, self._setups = host, {setup.name: setup for setup in setups}
+        self._directory, self._thread = PlaceDirectory(), JobThread("directory")
+        self._rankings: queue.SimpleQueue[RoomRanking] = queue.SimpleQueue()
+        self._growing: set[str] = set()
+        self._maps_due_s = 0.0  # monotonic
+        self._refusals = Throttle(1.0, 5.0)
+        self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
+        self._rooms: dict[str, ServedRoom] = {}
+        self._ports: dict[str, RoomPort] = {}
+        self._switch = RoomSwitch(self._ports, lambda room, name: self._setups[room].allows(name))
+        try:
+            for name, setup in self._setups.items():
+                self._rooms[name] = ServedRoom(
+                    setup.settings,
+                    _RoomHost(name, host, self),
+                    start_ns,
+                    setup.store,
+                    setup.observer,
+                    NoBlinding(),
+                    has_keys,
+                    _Neighbour(name, self),
+                )
+                self._ports[name] = _Port(self._rooms[name])
+        except BaseException:
+            self.close()
+            raise
+
+    def handle(self, event: EdgeEvent) -> None:
+        if not isinstance(event, PeerMessageReceived):
+            raise TypeError(f"{type(event).__name__} concerns one room")
+        room = self._switch.room_of(event.peer_id, event.frames)
+        if room is None:
+            self._host.send(event.peer_id, encode(Refused(_NO_ROOM)))
+            if (more := self._refusals.admit("", time.monotonic_ns())) is not None:
+                self._host.log_event("refused", f"{_NO_ROOM} (and {more} more)" if more else _NO_ROOM)
+        else:
+            self._rooms[room].handle(self._limited(event, self._setups[room]))
+
+    def _limited(self, event: PeerMessageReceived, setup: RoomSetup) -> PeerMessageReceived:
+        """Return the event with the names that may be in the room, of those that its sender may act for."""
+        if setup.names is None:
+            return event
+        names = setup.names if event.allowed_names is None else setup.names & event.allowed_names
+        return PeerMessageReceived(event.peer_id, event.frames, names, event.credential, event.permissions)
+
+    def step(self) -> None:
+        """Handle the answers of all rooms and of the directory, and the time that has passed."""
+        for room in self._rooms.values():
+            room.step()
+        with self._guard.step("a change of rooms"):
+            self._continue_searches()
+
+    def _continue_searches(self) -> None:
+        while not self._rankings.empty():
+            self._switch.add_ranking(self._rankings.get(), time.monotonic_ns())
+        self._switch.move_waiting(time.monotonic_ns())
+        if time.monotonic() >= self._maps_due_s:
+            self._maps_due_s = time.monotonic() + _MAPS_S
+            self._switch.building.keep(
+                {RoomMap(name, one) for name, room in self._rooms.items() for one in room.maps()}
+            )
+
+    def stop(self) -> None:
+        """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
+        for room in list(self._rooms.values()):
+            room.stop()
+
+    def close(self) -> str | None:
+        """End all processes and threads. Return which map files are incomplete and why, None if none is."""
+        reasons = []
+        for name, room in self._rooms.items():
+            if (reason := room.close()) is not None:
+                reasons.append(f"room '{name}': {reason}")
+        self._thread.stop(_TIMEOUT_S)
+        return "; ".join(reasons) or None
+
+    # ------------------------------------------------------------------ what is shown
+
+    def show_poses(self) -> None:
+        """Show the observer of each room the newest poses of its runs."""
+        for room in self._rooms.values():
+            room.show_poses()
+
+    def series(self) -> Mapping[str, Mapping[str, Any]]:
+        """Return `series` of each room."""
+        return {name: room.series() for name, room in self._rooms.items()}
+
+    def report(self) -> dict[str, Any]:
+        """Return edge.json of the whole site."""
+        reports = {name: room.report() for name, room in self._rooms.items()}
+        directory = {"keyframes": len(self._directory), "waiting": self._thread.pending_jobs}
+        report = site_report(reports, self._switch.building.poses)
+        return report | {"room_changes": self._switch.changes, "directory": directory}
+
+    # ------------------------------------------------------------------ what rooms tell
+
+    def begin_session(self, room: str) -> None:
+        self._thread.submit(partial(self._directory.remove_room, room))
+
+    def add_keyframe(self, added: AddKeyframe) -> None:
+        self._switch.add_keyframe(added)
+
+    def add_places(self, room: str, news: Sequence[PlaceNews]) -> None:
+        self._thread.submit(partial(self._update_directory, room, news))
+
+    def add_sought(self, room: str, sought: KeyframeSought) -> None:
+        with self._guard.step("a change of rooms"):
+            self._switch.add_answer(room, sought, time.monotonic_ns())
+
+    def expect_growth(self, room: str, is_expected: bool) -> None:
+        """Tell the host as long as the map of one room is restored."""
+        (self._growing.add if is_expected else self._growing.discard)(room)
+        self._host.expect_growth(bool(self._growing))
+
+    def _update_directory(self, room: str, news: Sequence[PlaceNews]) -> None:
+        """Job of the directory's thread."""
+        for one in news:
+            if (ranking := self._directory.update(room, one)) is not None:
+                self._rankings.put(ranking)
+        if not self._rankings.empty():
+            self._host.wake()
+
+
+class _RoomHost:
+    """The host of one room: it names the room in what is logged."""
+
+    def __init__(self, room: str, host: RoomHost, site: SiteRooms) -> None:
+        self._room, self._host, self._site = room, host, site
+
+    def wake(self) -> None:
+        self._host.wake()
+
+    def send(self, peer_id: bytes, frames: Sequence[Bytes]) -> None:
+        self._host.send(peer_id, frames)
+
+    def expect_growth(self, is_expected: bool) -> None:
+        self._site.expect_growth(self._room, is_expected)
+
+    def record(self, fields: dict[str, Any]) -> None:
+        self._host.record({**fields, "room": self._room})
+
+    def log_event(self, event: EventKind, reason: str) -> None:
+        self._host.log_event(event, f"room '{self._room}': {reason}")
+
+
+class _Port(RoomPort):
+    """What the switch asks of one room."""
+
+    def __init__(self, room: ServedRoom) -> None:
+        self._room = room
+
+    def knows(self, peer_id: bytes) -> int | None:
+        return self._room.protocol.knows(peer_id)
+
+    def is_present(self, name: str) -> bool:
+        return self._room.protocol.is_present(name)
+
+    def run(self, key: str) -> Peer | None:
+        return self._room.protocol.run(key)
+
+    def leave_objection(self, key: str) -> str | None:
+        return self._room.protocol.leave_objection(key)
+
+    def entry_objection(self, peer: Peer) -> str | None:
+        if self._room.is_waiting:
+            return "its map cannot be read now"
+        return self._room.protocol.entry_objection(peer, time.monotonic_ns())
+
+    def hand_over(self, key: str, room: str) -> Peer:
+        peer, effects = self._room.protocol.hand_over(key, room, time.monotonic_ns())
+        self._room.execute(effects)
+        return peer
+
+    def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
+        self._room.execute(self._room.protocol.take_over(peer, room, place, time.monotonic_ns()))
+
+    def find(self, request: FindKeyframe) -> None:
+        self._room.find(request)
+
+    def note_refused_entry(self, peer: Peer, room: str, reason: str) -> None:
+        effects = self._room.protocol.note_refused_entry(peer, room, reason, time.monotonic_ns())
+        self._room.execute(effects)
+
+
+class _Neighbour:
+    """What one room tells of itself, with its name."""
+
+    def __init__(self, room: str, site: SiteRooms) -> None:
+        self._room, self._site = room, site
+
+    def note_session(self) -> None:
+        self._site.begin_session(self._room)
+
+    def note_keyframe(self, added: AddKeyframe) -> None:
+        self._site.add_keyframe(added)
+
+    def note_places(self, news: Sequence[PlaceNews]) -> None:
+        self._site.add_places(self._room, news)
+
+    def note_sought(self, sought: KeyframeSought) -> None:
+        self._site.add_sought(self._room, sought)
