@@ -185,15 +185,20 @@ class OdometryBase:
         return f"its motion and its two poses differ by {mismatch_m:.2g} m and {mismatch_deg:.2g} degrees"
 
 
-def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> tuple[Keyframe, str | None]:
+def sanitise(
+    keyframe: Keyframe, base: OdometryBase | None, camera: Camera, forgotten_below: int = 0
+) -> tuple[Keyframe, str | None]:
     """Return the next keyframe of a run as the map accepts it, and what was wrong with it, None if nothing.
 
     base: the run's keyframe before; camera: its cam0. A keyframe with an implausible jump, or with a motion
-    that contradicts its two poses, starts a segment in the same odom. Poses relative to earlier keyframes
-    that contradict its steps are dropped, as is an image that cannot be this camera's. An excessive
-    covariance is bounded. Raises ValueError if its reference is not `base`.
+    that contradicts its two poses, starts a segment in the same odom, as does one whose reference is
+    forgotten: after `base`, below `forgotten_below`. Poses relative to earlier keyframes that contradict its
+    steps are dropped, as is an image that cannot be this camera's. An excessive covariance is bounded. Raises
+    ValueError if its reference is neither `base` nor forgotten.
     """
     problems = []
+    if (0 if base is None else base.id + 1) <= keyframe.reference < forgotten_below:
+        keyframe = _starting_segment(keyframe)
     if objection := image_objection(keyframe.image, camera):
         problems.append(f"keyframe {keyframe.id}: {objection}: without it")
         keyframe = replace(keyframe, image=keyframe.image.without_jpeg())
@@ -202,8 +207,7 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
             raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, not to the last one")
         if reason := _segment_reason(keyframe, base):
             problems.append(f"{reason}: new segment")
-            earlier = EarlierPoses.empty()
-            keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=earlier)
+            keyframe = _starting_segment(keyframe)
         else:
             earlier, problem = base.steps_to(keyframe).agreeing(keyframe.earlier)
             problems += [] if problem is None else [f"keyframe {keyframe.id}: {problem}"]
@@ -212,6 +216,10 @@ def sanitise(keyframe: Keyframe, base: OdometryBase | None, camera: Camera) -> t
         problems.append(f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown")
         keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / variance))
     return keyframe, "; ".join(problems) or None
+
+
+def _starting_segment(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=EarlierPoses.empty())
 
 
 def _segment_reason(keyframe: Keyframe, base: OdometryBase) -> str | None:

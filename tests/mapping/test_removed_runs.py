@@ -40,7 +40,8 @@ class Session:
     def __init__(self, store: MapStore, session: int = 7) -> None:
         kept = store.load()
         self.store, self.mapper = store, Mapper(CONFIG)
-        self.edge = EdgeProtocol(CONFIG, session, has_store=True, restored=restored_runs(kept, 0.05))
+        restored = restored_runs(kept, 0.05)
+        self.edge = EdgeProtocol(CONFIG, session, True, restored, forgotten=kept.forgotten)
         if kept.runs:
             self.mapper.restore(kept)
         self.sent: list[m.Message] = []
