@@ -81,6 +81,10 @@ class Atlas:
             out[self.graph.map_id(segment)] += len(self.graph.odometry.segments[segment].nodes)
         return out
 
+    @property
+    def has_several_maps(self) -> bool:
+        return len(self.graph.maps()) > 1
+
     def T_map_odom(self, agent: str) -> F64 | None:
         """T_map_odom (4, 4) at the agent's newest keyframe; None if its current segment has none."""
         newest = self.graph.odometry.newest_node(agent)
@@ -96,14 +100,9 @@ class Atlas:
 
     def waiting_segments(self) -> list[int]:
         """Segments of connected agents that wait to enter another's map."""
-        odometry = self.graph.odometry
-        return [
-            segment
-            for segment in odometry.live_segments
-            if odometry.current_segment(agent := odometry.segments[segment].agent) == segment
-            and not self._runs.is_absent(agent)
-            and not self.is_placed(odometry.segments[segment].nodes[-1])
-        ]
+        newest = map(self.graph.odometry.newest_node, self._runs.present())
+        nodes = self.graph.odometry.nodes
+        return sorted(nodes[n].segment for n in newest if n is not None and not self.is_placed(n))
 
     def all_poses(self) -> SavePoses:
         """Current pose and map of every keyframe."""

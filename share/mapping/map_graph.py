@@ -16,9 +16,8 @@ import numpy as np
 
 from share.geometry import se3
 from share.mapping.agents.covariance_scales import inflate_span
-from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge
-from share.mapping.graph.solver import GraphUpdate
+from share.mapping.graph_edges import GraphEdges
 from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.pose_table import PoseTable
 from share.mapping.segments import OdometrySegments
@@ -26,102 +25,6 @@ from share.types import F64, Keyframe
 
 _SHARED_INFORMATION = 2.0  # factor on the covariance of odometry over several keyframes: it shares its
 # measurements with that between neighbours
-
-
-class GraphEdges:
-    """Odometry and loop edges between node ids, and what of them the solver has not received yet."""
-
-    def __init__(self) -> None:
-        self.covariance_paths = CovariancePaths()
-        self.by_id: dict[int, PoseEdge] = {}
-        self.loops: dict[int, Loop] = {}  # by edge id, oldest first
-        self.spans: set[int] = set()  # edge ids of odometry over several keyframes
-        self._incident: dict[int, set[int]] = {}
-        self._next_id = 0
-        self.is_reset = True  # the next update contains the whole graph
-        self._sent_nodes: set[int] = set()  # nodes that the solver has
-        # Not sent to the solver yet:
-        self._pending_edges: set[int] = set()
-        self._moved_nodes: set[int] = set()  # new or moved
-        self._removed_edges: set[int] = set()
-        self._removed_nodes: set[int] = set()
-
-    def add(self, edge: PoseEdge, loop: Loop | None = None) -> int:
-        """Add an edge and return its id. With a loop, the solver treats it as a possible outlier."""
-        edge_id, self._next_id = self._next_id, self._next_id + 1
-        self.by_id[edge_id] = edge
-        self._pending_edges.add(edge_id)
-        if loop is not None:
-            self.loops[edge_id] = loop
-        for end in (edge.a, edge.b):
-            self._incident.setdefault(end, set()).add(edge_id)
-        self.covariance_paths.add(edge)
-        return edge_id
-
-    def add_span(self, edge: PoseEdge) -> None:
-        """Add an odometry edge over several keyframes, beside those between neighbours."""
-        self.spans.add(self.add(edge))
-
-    def remove(self, edge_id: int) -> None:
-        """Remove an edge, and its loop if it has one."""
-        edge = self.by_id.pop(edge_id)
-        self.spans.discard(edge_id)
-        self.loops.pop(edge_id, None)
-        for end in (edge.a, edge.b):
-            self._incident[end].discard(edge_id)
-        self.covariance_paths.remove(edge)
-        if edge_id in self._pending_edges:
-            self._pending_edges.discard(edge_id)
-        else:
-            self._removed_edges.add(edge_id)
-
-    def incident(self, node_id: int) -> list[int]:
-        """Ids of the edges that end at a node, oldest first."""
-        return sorted(self._incident.get(node_id, ()))
-
-    def degree(self, node_id: int) -> int:
-        """Number of edges that end at a node."""
-        return len(self._incident.get(node_id, ()))
-
-    def mark_moved(self, node_ids: Iterable[int]) -> None:
-        """Mark nodes whose poses differ from the solver's."""
-        self._moved_nodes.update(node_ids)
-
-    def remove_node(self, node_id: int) -> None:
-        """Remove a node that has no edges."""
-        self._incident.pop(node_id, None)
-        self._moved_nodes.discard(node_id)
-        if node_id in self._sent_nodes:
-            self._sent_nodes.discard(node_id)
-            self._removed_nodes.add(node_id)
-
-    def take_update(self, poses: PoseTable, gravity_factors: Mapping[int, F64]) -> GraphUpdate:
-        """Return all changes since the last call and count them as sent.
-
-        poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
-        """
-        edges = [(n, self.by_id[n], n in self.loops or n in self.spans) for n in sorted(self._pending_edges)]
-        moved = sorted(self._moved_nodes)
-        update = GraphUpdate.from_edges(
-            dict(zip(moved, poses.stack(moved), strict=True)),
-            edges,
-            sorted(self._removed_edges),
-            sorted(self._removed_nodes),
-            gravity_factors,
-        )
-        self.is_reset = False
-        self._sent_nodes |= self._moved_nodes
-        for sent in (self._pending_edges, self._moved_nodes, self._removed_edges, self._removed_nodes):
-            sent.clear()
-        return update
-
-    def reset(self) -> None:
-        """Count everything as not sent: the solver lost its state."""
-        self.is_reset = True
-        self._pending_edges = set(self.by_id)
-        self._moved_nodes |= self._sent_nodes
-        for forgotten in (self._sent_nodes, self._removed_edges, self._removed_nodes):
-            forgotten.clear()
 
 
 def _rescaled(edge: PoseEdge, log_change: float, covariance_ratio: float) -> PoseEdge:
@@ -155,6 +58,10 @@ class MapGraph:
         self.log_scales: dict[str, float] = {}
         self.covariance_scales: dict[str, float] = {}
         self.unsolved_maps: dict[int, None] = {}  # reference segments, longest unsolved first
+        self._joins_changed = False  # `loop_counts` has other pairs than at the last `update_maps`
+        self._maps: dict[int, list[int]] = {}
+        self._maps_state: tuple[int, int] | None = None  # of what `_maps` follows from
+        self._maps_version = 0  # of the reference segments
 
     def add_keyframe(
         self, agent: str, keyframe: Keyframe, cov: F64, gravity_factor: F64, rank: int = 0
@@ -223,7 +130,9 @@ class MapGraph:
     def add_loop_edge(self, edge: PoseEdge, loop: Loop) -> None:
         """Add a loop as an edge. Call `update_maps` afterwards if it connects two maps."""
         self.edges.add(edge, loop)
-        self.loop_counts[self.segment_pair(edge)] += 1
+        pair = self.segment_pair(edge)
+        self._joins_changed |= pair not in self.loop_counts
+        self.loop_counts[pair] += 1
 
     def remove_loop_edge(self, edge_id: int) -> None:
         """Remove a loop's edge. Call `update_maps` afterwards if it was the last between its segments."""
@@ -231,6 +140,7 @@ class MapGraph:
         self.loop_counts[pair] -= 1
         if not self.loop_counts[pair]:
             del self.loop_counts[pair]
+            self._joins_changed = True
         self.edges.remove(edge_id)
 
     def drop_loops(self, edge_ids: Sequence[int]) -> tuple[Loop, ...]:
@@ -332,7 +242,7 @@ class MapGraph:
 
     def find_map(self, map_id: str) -> int:
         """Reference segment of the map of this name. Raises ValueError if there is none."""
-        for reference_segment in {self.reference_segments[s] for s in self.odometry.live_segments}:
+        for reference_segment in self.maps():
             if self.odometry.segments[reference_segment].name == map_id:
                 return reference_segment
         raise ValueError(f"there is no map {map_id}")
@@ -343,10 +253,18 @@ class MapGraph:
 
     def map_segments(self, reference_segment: int) -> list[int]:
         """Segments of a map that have keyframes, in order of precedence."""
-        return sorted(
-            (s for s in self.odometry.live_segments if self.reference_segments[s] == reference_segment),
-            key=self.rank,
-        )
+        return list(self.maps().get(reference_segment, ()))
+
+    def maps(self) -> Mapping[int, Sequence[int]]:
+        """Return the segments of each map that have keyframes, in order of precedence, by reference
+        segment."""
+        state = self.odometry.live_version, self._maps_version
+        if state != self._maps_state:
+            maps: dict[int, list[int]] = {}
+            for segment in sorted(self.odometry.live_segments, key=self.rank):
+                maps.setdefault(self.reference_segments[segment], []).append(segment)
+            self._maps, self._maps_state = maps, state
+        return self._maps
 
     def map_nodes(self, reference_segment: int) -> list[int]:
         return [n for s in self.map_segments(reference_segment) for n in self.odometry.segments[s].nodes]
@@ -386,7 +304,11 @@ class MapGraph:
         return (a, b) if a < b else (b, a)
 
     def update_maps(self) -> None:
-        """Recompute the reference segment of every segment: the connected components of the loops."""
+        """Recompute the reference segment of every segment: the connected components of the loops. Costs
+        nothing while the same segments are connected."""
+        if not self._joins_changed:
+            return
+        self._joins_changed, self._maps_version = False, self._maps_version + 1
         root = list(range(len(self.reference_segments)))
 
         def find(i: int) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from heapq import nlargest
 from typing import Any, cast
 
 from share.config import Config
@@ -22,10 +23,13 @@ from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, SavePoses, StoredMap
 from share.mapping.mapper_log import MapperLog
 from share.mapping.query_queue import QueryQueue, map_rank, restored_ranks, service_kind
+from share.mapping.recent_runs import RecentRuns
 from share.mapping.recognition.keyframe_views import ArchiveReader, KeyframeViews
 from share.mapping.steps import Job, LookupStep, SolveStep, Step, StepRunner
 from share.types import Keyframe
 from share.wire.messages import Hello
+
+_MAX_MAPS = 64  # in a report, beside those of the runs that it lists
 
 
 class Mapper:
@@ -44,6 +48,7 @@ class Mapper:
         self._lookup = KeyframeLookup(config, self.atlas, self.views, self.queries, self._hellos, self._log)
         self._lookup_job, self._solve_job = StepRunner(), StepRunner()
         self._empty_runs: list[KeyframeKey] = []
+        self._recent_runs = RecentRuns(config.edge.max_agents)
         self._retention = Retention(config.edge.keep_days)
 
     # Runs
@@ -52,6 +57,7 @@ class Mapper:
         """Register a run of an agent, before its first keyframe. credential: see `SaveRun`."""
         self._hellos[agent] = hello
         self._counters.add_run(agent)
+        self._recent_runs.add(agent, hello.name)
         self.atlas.add_run(agent, hello.name, credential)
 
     def set_credential(self, agent: str, credential: str) -> None:
@@ -63,6 +69,7 @@ class Mapper:
 
     def set_present(self, agent: str, is_present: bool) -> None:
         self.atlas.set_present(agent, is_present)
+        self._recent_runs.set_present(agent, is_present)
         if self.atlas.is_run_gone(agent) and self._counters.runs[agent].newest_id >= 0:
             self._note_empty(agent)  # its keyframes expired while it was connected
 
@@ -73,6 +80,7 @@ class Mapper:
         self._publisher.remove_agent(agent)
         del self._hellos[agent]
         self._counters.remove_run(agent)
+        self._recent_runs.remove(agent)
 
     # Keyframes
 
@@ -171,7 +179,7 @@ class Mapper:
 
     def _next_query(self) -> int | None:
         node_id = self.queries.next_query()
-        if node_id is None and len(self.atlas.map_sizes()) > 1:
+        if node_id is None and self.atlas.has_several_maps:
             node_id = self.queries.next_skipped()  # too late for an answer, but it may merge maps
         return node_id
 
@@ -239,19 +247,25 @@ class Mapper:
         return self.atlas.all_poses()
 
     def report(self) -> dict[str, Any]:
-        """Return the mapper's fields of edge.json, and under `agents` those of each run."""
-        atlas = self.atlas
+        """Return the mapper's fields of edge.json, and under `agents` those of the runs that the edge lists.
+        Of maps it lists theirs and the largest others."""
+        atlas, runs = self.atlas, self._recent_runs.listed()
+        standings, sizes = atlas.quarantine.agreement.standings(runs), atlas.map_sizes()
+        agents = {
+            agent: {
+                **self._counters.runs[agent].report(),
+                "queries_skipped": self.queries.skipped[agent],
+                "map_id": atlas.current_map_id(agent),
+                "consistency": asdict(standings[agent]),
+            }
+            for agent in runs
+        }
+        shown = {one["map_id"] for one in agents.values()}.union(nlargest(_MAX_MAPS, sizes, sizes.__getitem__))
+        maps = {map_id: size for map_id, size in sizes.items() if map_id in shown}
         return {
-            "agents": {
-                agent: {
-                    **own.report(),
-                    "queries_skipped": self.queries.skipped[agent],
-                    "map_id": atlas.current_map_id(agent),
-                    "consistency": asdict(atlas.quarantine.agreement.standing(agent)),
-                }
-                for agent, own in self._counters.runs.items()
-            },
-            "maps": atlas.map_sizes(),
+            "agents": agents,
+            "maps": maps,
+            "unlisted_maps": len(sizes) - len(maps),
             "waiting": len(self.queries),
             **self._counters.report(len(atlas.loop_acceptance.pending), len(atlas.graph.edges.loops)),
         }

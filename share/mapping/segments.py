@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from share.mapping.loops import KeyframeKey
@@ -48,13 +50,15 @@ class Segment:
 class OdometrySegments:
     """Nodes by id, in order of arrival, and the segments that they form, oldest first.
 
-    live_segments: those that still have nodes.
+    live_segments: those that still have nodes. live_version: changes with them.
     """
 
     def __init__(self) -> None:
         self.nodes: dict[int, Node] = {}
         self.segments: list[Segment] = []
         self.live_segments: dict[int, None] = {}
+        self.live_version = 0
+        self._live_counts = Counter[str]()  # live segments by agent
         self._next_id = 0
         self._node_ids: dict[KeyframeKey, int] = {}
         self._current: dict[str, int] = {}  # current segment of each agent
@@ -94,7 +98,8 @@ class OdometrySegments:
         node_id, self._next_id = self._next_id, self._next_id + 1
         self.nodes[node_id] = Node(key, segment, ordinal, T_odom_body)
         target.nodes.append(node_id)
-        self.live_segments[segment] = None
+        if segment not in self.live_segments:
+            self._mark_live(segment, True)
         target.total_count = ordinal + 1
         self._node_ids[key] = node_id
         return node_id
@@ -105,13 +110,22 @@ class OdometrySegments:
         nodes = self.segments[node.segment].nodes
         nodes.remove(node_id)
         if not nodes:
-            del self.live_segments[node.segment]
+            self._mark_live(node.segment, False)
         del self._node_ids[node.key]
+
+    def _mark_live(self, segment: int, is_live: bool) -> None:
+        self.live_version += 1
+        self._live_counts[self.segments[segment].agent] += 1 if is_live else -1
+        if is_live:
+            self.live_segments[segment] = None
+        else:
+            del self.live_segments[segment]
 
     def remove_agent(self, agent: str) -> None:
         """Forget an agent without nodes. Its segments keep their indices."""
         self._current.pop(agent, None)
         self._segment_counts.pop(agent, None)
+        self._live_counts.pop(agent, None)
 
     def newest_node(self, agent: str) -> int | None:
         """Newest node of the agent's current segment, or None."""
@@ -119,7 +133,7 @@ class OdometrySegments:
         return nodes[-1] if nodes else None
 
     def has_nodes(self, agent: str) -> bool:
-        return any(self.segments[segment].agent == agent for segment in self.live_segments)
+        return self._live_counts[agent] > 0
 
     def has_keyframe(self, key: KeyframeKey) -> bool:
         return key in self._node_ids
@@ -168,12 +182,15 @@ class AgentRuns:
 
     def __init__(self) -> None:
         self._name_by_run: dict[str, str] = {}
+        self._runs_by_name: dict[str, dict[str, None]] = {}  # in order of registration
+        self._present: dict[str, None] = {}  # registered runs that are connected
         self._present_run: dict[str, str] = {}  # current run of each name, by when it last connected
         self._absent: set[str] = set()
 
     def add(self, run: str, name: str) -> None:
         """Register a new run, which becomes the current one of its name."""
         self._name_by_run[run] = name
+        self._runs_by_name.setdefault(name, {})[run] = None
         self.set_present(run, True)
 
     def set_present(self, run: str, is_present: bool) -> bool:
@@ -184,8 +201,10 @@ class AgentRuns:
         was_absent = run in self._absent
         if not is_present:
             self._absent.add(run)
+            self._present.pop(run, None)
             return not was_absent
         self._absent.discard(run)
+        self._present[run] = None
         name = self.name(run)
         self._present_run.pop(name, None)
         self._present_run[name] = run
@@ -194,10 +213,19 @@ class AgentRuns:
     def remove(self, run: str) -> None:
         name = self._name_by_run.pop(run, run)
         self._absent.discard(run)
+        self._present.pop(run, None)
+        remaining = self._runs_by_name.get(name, {})
+        remaining.pop(run, None)
         if self._present_run.get(name) == run:
             del self._present_run[name]
-            if remaining := [one for one in self._name_by_run if self._name_by_run[one] == name]:
-                self._present_run[name] = remaining[-1]
+            if remaining:
+                self._present_run[name] = next(reversed(remaining))
+        if not remaining:
+            self._runs_by_name.pop(name, None)
+
+    def present(self) -> Iterable[str]:
+        """Return the registered runs that are connected."""
+        return self._present
 
     def name(self, run: str) -> str:
         return self._name_by_run.get(run, run)

@@ -7,14 +7,14 @@ from math import ceil
 
 from share.config import EdgeConfig
 from share.mapping.loops import KeyframeKey
+from share.mapping.recent_runs import RecentRuns
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.peer import Peer, RestoredRun, Sender
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
 from share.types import AgentKind
 from share.wire.messages import Hello, PoseUpdate, public_tag
 
-# Limits on new runs, each at once and a second: each run stays in the report, and in the map once it has a
-# keyframe. One name: as many as a person starts while trying things out; one key: a full room; the edge: two.
+# Limits on new runs, each at once and a second: each run stays in the map once it has a keyframe. One name: as many as a person starts while trying things out; one key: a full room; the edge: two.
 _NAME_LIMIT, _CREDENTIAL_LIMIT, _EDGE_LIMIT = (8.0, 0.1), (32.0, 0.25), (128.0, 2.0)
 _SILENT_S = 0.6  # an agent pings every 0.5 s
 NAME_HOLD_S = 3.0  # a name stays in use for this long after its agent's last message
@@ -124,19 +124,24 @@ def name_objection(name: str, allowed_names: Collection[str]) -> str:
 
 # Registry of the runs that an edge knows, ended ones included.
 _MAX_IDLE = 256  # runs that left without a keyframe; beyond, the oldest is forgotten
+_MAX_HEARD = 64  # absent runs that sent something last
 _MAX_FORGOTTEN = 65_536  # forgotten runs that are still recognised; older ones have been silent for hours
 
 
 class RunRegistry(Mapping[bytes, Peer]):
     """Runs by their peer id on the link. Each run has a key that names it everywhere else; the run of a name
-    that joined or came back last is the latest. unjoined: what is counted of all other peers together."""
+    that joined or came back last is the latest. unjoined: what is counted of all other peers together.
 
-    def __init__(self) -> None:
+    No message, tick or report looks at all runs: there may be thousands. max_agents: present at once."""
+
+    def __init__(self, max_agents: int = EdgeConfig.max_agents) -> None:
         self.unjoined = Sender()
         self.by_key: dict[str, Peer] = {}
         self._present: dict[str, Peer] = {}
         self._peers: dict[bytes, Peer] = {}
-        self._runs_by_name: dict[str, dict[str, Peer]] = {}  # by key, the latest last
+        self._recent = RecentRuns(max_agents)
+        self._without_keyframe: dict[str, Peer] = {}  # when last looked at
+        self._heard: dict[str, Peer] = {}  # absent runs that have sent something
         self._empty_runs: dict[str, int] = {}  # runs without anything in the map: their newest keyframe
         self._forgotten_ids: dict[bytes, None] = {}
         self.forgotten_count = 0  # since the edge started
@@ -162,18 +167,33 @@ class RunRegistry(Mapping[bytes, Peer]):
         """Record that a known run takes part; it becomes the latest of its name."""
         peer.is_gone = False
         self._present[peer.key] = peer
-        runs = self._runs_by_name.setdefault(peer.name, {})
-        runs.pop(peer.key, None)
-        runs[peer.key] = peer
+        self._recent.set_present(peer.key, True)
+        self._heard.pop(peer.key, None)
 
     def mark_gone(self, peer: Peer) -> None:
         """Record that a run has left."""
         peer.is_gone = True
         self._present.pop(peer.key, None)
+        self._recent.set_present(peer.key, False)
+
+    def mark_heard(self, peer: Peer) -> None:
+        """Record that an absent run has sent a message."""
+        self._heard.pop(peer.key, None)
+        self._heard[peer.key] = peer
+        if len(self._heard) > _MAX_HEARD:
+            del self._heard[next(iter(self._heard))]
 
     def is_latest(self, peer: Peer) -> bool:
         """Return whether no other run of its name joined or came back later."""
-        return next(reversed(self._runs_by_name[peer.name])) == peer.key
+        return self._recent.is_latest(peer.key)
+
+    def listed(self) -> list[Peer]:
+        """Return the runs that a report lists."""
+        return [self.by_key[key] for key in self._recent.listed()]
+
+    def heard(self) -> list[Peer]:
+        """Return the runs that may have sent something lately: the listed, and absent ones that did."""
+        return list({peer.key: peer for peer in (*self.listed(), *self._heard.values())}.values())
 
     def shares_map(self, peer: Peer) -> bool:
         """Return whether a run shares a map with another that is present, or no other is."""
@@ -193,6 +213,9 @@ class RunRegistry(Mapping[bytes, Peer]):
     def add(self, peer: Peer) -> None:
         """Add a run that takes part."""
         self._peers[peer.id] = self.by_key[peer.key] = peer
+        self._recent.add(peer.key, peer.name)
+        if peer.reorder_buffer.next_keyframe == 0:
+            self._without_keyframe[peer.key] = peer
         self.mark_present(peer)
 
     def restore(self, run: RestoredRun) -> None:
@@ -221,12 +244,10 @@ class RunRegistry(Mapping[bytes, Peer]):
     def forget(self, peer: Peer) -> bool:
         """Remove a run for good. Return whether it was the latest of its name."""
         del self.by_key[peer.key], self._peers[peer.id]
-        self._present.pop(peer.key, None)
-        self._empty_runs.pop(peer.key, None)
+        for runs in (self._present, self._empty_runs, self._without_keyframe, self._heard):
+            runs.pop(peer.key, None)
         was_latest = self.is_latest(peer)
-        del self._runs_by_name[peer.name][peer.key]
-        if not self._runs_by_name[peer.name]:
-            del self._runs_by_name[peer.name]
+        self._recent.remove(peer.key)
         if peer.odometry_base is not None:
             self.forgotten_count += 1
             self._forgotten_ids[peer.id] = None
@@ -241,7 +262,12 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     def oldest_idle(self) -> Peer | None:
         """Return the oldest of too many runs without a keyframe, None if they are not too many."""
-        idle = [peer for peer in self._peers.values() if peer.is_idle]
+        self._without_keyframe = {
+            key: peer
+            for key, peer in self._without_keyframe.items()
+            if peer.reorder_buffer.next_keyframe == 0
+        }
+        idle = [peer for peer in self._without_keyframe.values() if peer.is_idle]
         if len(idle) < _MAX_IDLE:
             return None
         return min(idle, key=lambda peer: (peer.last_received_ns, peer.id))

@@ -55,7 +55,9 @@ class EdgeProtocol:
         objects: Sequence[SaveObject] = (),
         trackers: RunTrackers | None = None,
     ) -> None:
-        self._config, self._session, self._registry = config, session, RunRegistry()
+        self._config, self._session = config, session
+        self._config_report = to_mapping(config)
+        self._registry = RunRegistry(config.edge.max_agents)
         for run in restored:
             self._registry.restore(run)
         self.latest_poses = self._registry.latest_poses
@@ -131,6 +133,8 @@ class EdgeProtocol:
         except WireError as error:
             self._out.count_bad_message(client or peer, str(error), throttled=client is not None)
             return
+        if peer is not None and peer.is_gone:
+            self._registry.mark_heard(peer)
         if peer is not None and not self._membership.may_send(event, peer, message):
             return
         if client is not None and not self.room.may_send(event, client):
@@ -274,8 +278,10 @@ class EdgeProtocol:
     # ------------------------------------------------------------------ reports
 
     def series(self) -> dict[str, Any]:
-        """Return each agent's evaluations with QoE and rate (`RateScheduler.series`)."""
-        return {peer.name: self._rate_scheduler.series(peer.name) for peer in self._registry.values()}
+        """Return the evaluations with QoE and rate (`RateScheduler.series`) of each agent that `report`
+        lists."""
+        names = dict.fromkeys(peer.name for peer in self._registry.listed())
+        return {name: self._rate_scheduler.series(name) for name in names}
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         """Return the report of a run without what the mapper knows of it."""
@@ -285,8 +291,8 @@ class EdgeProtocol:
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, with `agents` by run key. Names of
-        runs are `RunRegistry.label`."""
-        peers, mapped = self._registry.values(), map_report.get("agents", {})
+        runs are `RunRegistry.label`. Of absent runs it lists the recent ones and counts the rest."""
+        peers, mapped = self._registry.listed(), map_report.get("agents", {})
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
@@ -295,15 +301,16 @@ class EdgeProtocol:
                 self._registry.label(peer): self._peer_report(peer) | mapped.get(peer.key, {})
                 for peer in peers
             },
+            "unlisted_runs": len(self._registry) - len(peers),
             "unjoined": dict(self._registry.unjoined.counts),
             "refused": [
                 *filter(None, [self._rate_scheduler.full_reason(self._out.now_ns)]),
-                *fault_warnings(peers, self._registry.unjoined, self._out.now_ns),
+                *fault_warnings(self._registry.heard(), self._registry.unjoined, self._out.now_ns),
                 *self.room.warnings(),
             ],
             **self.room.report(),
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,
             "version": __version__,
-            "config": to_mapping(self._config),
+            "config": self._config_report,
         }

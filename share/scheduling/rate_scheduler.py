@@ -38,6 +38,7 @@ class RateScheduler:
         self._is_full = False
         self._history: dict[str, RingBuffer] = {}  # of all runs of a name
         self._latest: dict[str, RatedEvaluation] = {}  # of the present run
+        self._targets: dict[tuple[str, AgentKind], float] = {}  # by name, "" of one without own parameters
 
     def begin_run(self, agent: str) -> None:
         """Start a new run of an agent, without a limit until its first evaluation."""
@@ -96,8 +97,13 @@ class RateScheduler:
             name: None if rated is None else getattr(rated, name)
             for name in ("rate_hz", "qoe", "delay_ms", "error_cm")
         }
-        target = QoeParameters.from_config(self._config, kind, agent or "").target
-        return {**newest, "qoe_target": target}
+        return {**newest, "qoe_target": self._target(agent or "", kind)}
+
+    def _target(self, agent: str, kind: AgentKind) -> float:
+        key = agent if agent in self._config.agents else "", kind
+        if key not in self._targets:
+            self._targets[key] = QoeParameters.from_config(self._config, kind, key[0]).target
+        return self._targets[key]
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """Return `series` for edge.json: a list for each field of `RatedEvaluation`."""

@@ -6,7 +6,7 @@ Small scale errors are corrected, and understated variances enlarged.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -44,6 +44,7 @@ class Quarantine:
         self.agreement = AgentAgreement()
         self._graph, self._loop_acceptance = graph, loop_acceptance
         self.withdrawn: list[Loop] = []
+        self._applied_scales: dict[str, tuple[float, float]] | None = None  # None: not of all runs
         self._to_reconsider: list[Loop] = []
 
     def remove_run(self, run: str) -> None:
@@ -55,8 +56,11 @@ class Quarantine:
     def add_step(self, node_id: int, T_ref_body: F64, cov: F64) -> None:
         """Add a node, by odometry from the previous one of its segment."""
         odometry = self._graph.odometry
-        agent = odometry.nodes[node_id].key.agent
-        if self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov):
+        agent, previous = odometry.nodes[node_id].key.agent, odometry.previous_node(node_id)
+        may_have_changed = self.agreement.add_step(agent, node_id, previous, T_ref_body, cov)
+        if previous is None:
+            self._apply_scales_to([agent])
+        elif may_have_changed:
             self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
@@ -93,6 +97,8 @@ class Quarantine:
     def quarantined_nodes(self, agent: str) -> tuple[int, ...]:
         """Nodes of agents that must not share a map with this one."""
         odometry = self._graph.odometry
+        if not self.agreement.quarantined and not self.agreement.disputed:
+            return ()
         segments = [odometry.segments[segment] for segment in sorted(odometry.live_segments)]
         separated = {s.agent for s in segments if self.agreement.are_separated(agent, s.agent)}
         return tuple(n for s in segments if s.agent in separated for n in s.nodes) if separated else ()
@@ -135,10 +141,24 @@ class Quarantine:
         return self._graph.log_scales.get(agent, 0.0)
 
     def apply_scales(self) -> None:
+        """Correct the odometry of agents whose scales have changed."""
+        before, scales = self._applied_scales, self.agreement.applied_scales()
+        if scales == before:
+            return
+        self._applied_scales = scales
+        identity, odometry = self.agreement.identities.identity, self._graph.odometry
+        live = {odometry.segments[segment].agent for segment in odometry.live_segments}
+        self._apply_scales_to(
+            sorted(
+                run
+                for run in live
+                if before is None or scales.get(identity(run)) != before.get(identity(run))
+            )
+        )
+
+    def _apply_scales_to(self, runs: Iterable[str]) -> None:
         agreement, graph = self.agreement, self._graph
-        for agent in sorted(
-            {graph.odometry.segments[segment].agent for segment in graph.odometry.live_segments}
-        ):
+        for agent in runs:
             scales = agreement.log_scale(agent), agreement.covariance_scale(agent)
             if scales != (self._log_scale(agent), graph.covariance_scales.get(agent, 1.0)):
                 graph.rescale_odometry(agent, *scales)
@@ -147,7 +167,7 @@ class Quarantine:
         """Mark agents outside a restored session's largest map as unverified: they may have been
         quarantined.
         """
-        identities = self.agreement.identities
+        self._applied_scales, identities = None, self.agreement.identities
         maps = [
             self._agents_in_map(reference_segment)
             for reference_segment in sorted(set(self._graph.reference_segments))
