@@ -5,7 +5,6 @@ Plain sequential calls, without clock or thread.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -76,10 +75,7 @@ class Atlas:
         return None if segment is None else self.graph.map_id(segment)
 
     def map_sizes(self) -> dict[str, int]:
-        out = Counter[str]()
-        for segment in sorted(self.graph.odometry.live_segments):
-            out[self.graph.map_id(segment)] += len(self.graph.odometry.segments[segment].nodes)
-        return out
+        return self.graph.map_sizes()
 
     @property
     def has_several_maps(self) -> bool:

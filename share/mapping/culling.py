@@ -107,12 +107,8 @@ class KeyframeCulling:
 
     def _choose_with(self, count: int, reserve: ReturnReserve) -> InSlices[list[int]]:
         maps = self._segments_by_map()
-        finished = [
-            reference_segment
-            for reference_segment, segments in maps.items()
-            if self._is_finished(segments, reserve)
-        ]
-        ongoing = [reference_segment for reference_segment in maps if reference_segment not in set(finished)]
+        is_finished = {one: self._is_finished(segments, reserve) for one, segments in maps.items()}
+        finished, ongoing = ([one for one in maps if is_finished[one] is wanted] for wanted in (True, False))
         protected = yield from self._protected(ongoing, reserve)
         quotas, out = self._quotas(count, protected), dict[int, None]()
         for reference_segment in (*finished, *ongoing):

@@ -261,10 +261,20 @@ class MapGraph:
         state = self.odometry.live_version, self._maps_version
         if state != self._maps_state:
             maps: dict[int, list[int]] = {}
-            for segment in sorted(self.odometry.live_segments, key=self.rank):
+            for segment in sorted(self.odometry.live_segments):
                 maps.setdefault(self.reference_segments[segment], []).append(segment)
+            for segments in maps.values():
+                segments.sort(key=self.rank)
             self._maps, self._maps_state = maps, state
         return self._maps
+
+    def map_sizes(self) -> dict[str, int]:
+        """Return how many keyframes each map has, by its name."""
+        segments = self.odometry.segments
+        return {
+            segments[reference_segment].name: sum([len(segments[s].nodes) for s in own])
+            for reference_segment, own in self.maps().items()
+        }
 
     def map_nodes(self, reference_segment: int) -> list[int]:
         return [n for s in self.map_segments(reference_segment) for n in self.odometry.segments[s].nodes]

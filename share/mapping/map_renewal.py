@@ -73,10 +73,11 @@ class MapRenewal:
             return []
         T = graph.poses[node_id]
         near_ids, poses = graph.poses.near(T, PLACE_M)
+        own = set(graph.map_nodes(graph.reference_segments[graph.odometry.nodes[node_id].segment]))
         near = [
             i
             for i, n in enumerate(near_ids.tolist())
-            if is_earlier(n) and n in self._camera_views and graph.is_same_map(n, node_id)
+            if n in own and is_earlier(n) and n in self._camera_views
         ]
         if not near:
             return []

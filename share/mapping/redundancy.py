@@ -51,6 +51,9 @@ def redundant(
     closer than `max_distance`. owners: name of each pose; None: must stay. quotas: removals of each name;
     counted down.
     """
+    if len(poses) == 1:  # of many runs that are over at once
+        yield 1
+        return _redundant_alone(owners[0], quotas) if max_distance == np.inf else []
     nearest = TwoNearest(poses, max_distance)
     names = np.array([name or "" for name in owners])
     is_removable = np.array([name is not None and quotas[name] > 0 for name in owners], bool)
@@ -77,6 +80,14 @@ def redundant(
         if len(out) % _REMOVED_PER_SLICE == 0:
             yield _REMOVED_PER_SLICE * _REMOVAL_COST
     return out
+
+
+def _redundant_alone(owner: str | None, quotas: Counter[str]) -> list[int]:
+    """Return what `redundant` does of a pose without others."""
+    if owner is None or quotas[owner] <= 0:
+        return []
+    quotas[owner] -= 1
+    return [0]
 
 
 class TwoNearest:

@@ -225,8 +225,9 @@ def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list
     """Return a warning line for each sender with repeatedly refused messages or suspect keyframes."""
     kinds = [("peers that have not joined", "messages refused", unjoined.refusals)]
     for peer in peers:
-        kinds.append((f"agent '{peer.name}'", "messages refused", peer.refusals))
-        kinds.append((f"agent '{peer.name}'", "suspect keyframes", peer.suspect_keyframes))
+        if peer.refusals.count or peer.suspect_keyframes.count:
+            kinds.append((f"agent '{peer.name}'", "messages refused", peer.refusals))
+            kinds.append((f"agent '{peer.name}'", "suspect keyframes", peer.suspect_keyframes))
     return fault_lines(kinds, now_ns)
 
 
