@@ -41,7 +41,7 @@ METRICS: tuple[MetricSpec, ...] = (
     MetricSpec("share_edge_map_keyframes", "Keyframes in a map.", "", "maps", ("map",)),
     MetricSpec("share_edge_room_agents", "Agents in a room of a site.", "agents", "rooms", ("room",)),
     MetricSpec("share_edge_room_keyframes", "Keyframes of a room.", "keyframes", "rooms", ("room",)),
-    MetricSpec("share_edge_room_waiting_keyframes", "The same, of a room.", "waiting", "rooms", ("room",)),
+    MetricSpec("share_edge_room_waiting_keyframes", "Waiting, of a room.", "waiting", "rooms", ("room",)),
     MetricSpec("share_edge_room_changes_total", "Agents that went on in another room.", "room_changes"),
     MetricSpec("share_edge_loops", "Loops in the maps.", "loops.in_map"),
     MetricSpec("share_edge_loops_waiting", "Loops waiting for a supporting loop.", "loops.waiting"),

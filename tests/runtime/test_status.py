@@ -257,7 +257,8 @@ def test_metrics_that_the_report_lacks_are_omitted():
 
 
 def test_every_metric_has_a_value_in_a_real_report():
-    more = {"uptime_s": 1.0, "trouble": [], "degraded": [], "headset": headset_report()}
+    more = {"uptime_s": 1.0, "trouble": [], "degraded": [], "headset": headset_report(), "room_changes": 0}
+    more |= {"rooms": {"lab": {"agents": 1, "keyframes": 2, "waiting": 0}}}
     body, _ = edge_metrics.render_metrics({**real_report(), **more})
     names = {name for name, _ in metrics(body)}
     absent = {row.name for row in edge_metrics.METRICS} - names
