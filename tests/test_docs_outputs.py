@@ -185,7 +185,8 @@ def test_keys_of_health_are_those_that_the_code_writes(run: Run) -> None:
 
 @pytest.mark.long
 def test_metrics_and_their_labels_are_those_that_the_code_writes(run: Run) -> None:
-    text = render_metrics(run.report | {"headset": headset_report()})[0].decode()
+    site = {"rooms": {"lab": {"agents": 1, "keyframes": 2, "waiting": 0}}, "room_changes": 1}
+    text = render_metrics(run.report | {"headset": headset_report()} | site)[0].decode()
     written: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(text):
         name = family.name + ("_total" if family.type == "counter" else "")

@@ -128,7 +128,7 @@ def test_no_arguments_prints_help_with_exit_code_2(capsys):
     [
         ("trak", "no command 'trak'; did you mean 'track'?"),
         ("Edge", "no command 'Edge'; did you mean 'edge'?"),
-        ("xyz", "no command 'xyz'; commands: demo, capture, track, agent, edge, watch, dataset"),
+        ("xyz", "no command 'xyz'; commands: demo, capture, track, agent, edge, site, watch, dataset"),
         ("--bogus", "No such option '--bogus'"),
         ("dataset inf", "no command 'inf'; did you mean 'info'?"),
         ("evaluate ate", "no command 'ate'; commands: run, score, ablation, sweep, paper, compare"),
