@@ -12,6 +12,7 @@ from helpers.hellos import hello_of
 
 from share.config import Config
 from share.geometry import se3
+from share.mapping.corrections import map_assignment
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import RemoveKeyframes, RemoveRun
 from share.mapping.mapper import Mapper
@@ -127,18 +128,126 @@ def test_the_remaining_map_is_restored(tmp_path: Path) -> None:
         assert len(second.mapper.current_poses().keys) <= 1.05 * MOST
 
 
-def test_a_removed_run_that_returns_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def keyframes_of(store: MapStore, run_id: int) -> set[int]:
+    """Ids of eve's keyframes of this run in the file."""
+    run = f"eve-{m.public_tag(run_id)[:4]}"
+    return {k.keyframe_key.id for k in store.load().keyframes if k.run_key == run}
+
+
+def returned(session: Session, run_id: int, count: int) -> list[m.Message]:
+    """A run of eve says hello, sends its first `count` keyframes again, and two new ones. Return the answers."""
+    session.sent.clear()
+    session.tell(run_id, hello_of("eve", run_id))
+    for k in range(count + 2):
+        step, before = (at(k), -1) if k == 0 else (at(1.0), k - 1)
+        own = Keyframe(k, before, k * S, step, 1e-6 * np.eye(6), at(k), np.zeros(3), 0.0, EMPTY, k - 1)
+        session.tell(run_id, own)
+    return session.sent
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_removed_run_that_returns_goes_on_with_new_keyframes(tmp_path: Path, restarts: bool) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        session = crowded(store)
-        session.tell(100, hello_of("eve", 100))
-        refused = session.sent[-1]
-        assert isinstance(refused, m.Refused)
-        assert "start the agent again" in refused.reason
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 8)
+        emptied(session, 100)
+        assert [run.hello.name for run in store.load().runs] == ["ann"]
+        session = Session(store, session=8) if restarts else session
         session.now_ns += 100 * S
-        session.tell(999, hello_of("eve", 999))
-        welcome, rate = session.sent[-2:]
-        assert isinstance(welcome, m.Welcome)
-        assert isinstance(rate, m.Rate)
+        answers = returned(session, 100, 8)
+        assert m.Welcome(8 if restarts else 7, 8) in answers
+        assert [one.next_keyframe for one in answers if isinstance(one, m.Ack)] == [8] * 8 + [9, 10]
+        assert keyframes_of(store, 100) == {8, 9}
+        held = {key.id for key in session.mapper.current_poses().keys if key.agent.startswith("eve")}
+        assert held == {8, 9}
+        assert store.load().problems == ()
+        third = Session(store, session=9)
+        third.now_ns += 200 * S
+        assert m.Welcome(9, 10) in returned(third, 100, 10)
+        assert keyframes_of(store, 100) == {8, 9, 10, 11}
+
+
+def test_a_run_that_returned_and_left_without_a_keyframe_is_still_known(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 8)
+        emptied(session, 100)
+        session.run("eve", 100, 0)
+        for k in range(300):  # so that it is no longer among the runs that left without a keyframe
+            session.run(f"n{k}", 1000 + k, 0)
+        assert "eve" not in session.edge.report({})["agents"]
+        assert m.Welcome(7, 8) in returned(session, 100, 8)
+
+
+def test_a_connected_run_whose_keyframes_expired_is_known_after_a_restart(tmp_path: Path) -> None:
+    """The file has its row, and no keyframe of it."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("eve", 100, 8, stays=True)
+        atlas = session.mapper.atlas
+        session.mapper.remove_keyframes(list(atlas.graph.poses))
+        session.handle(Tick())
+        assert [run.hello.name for run in store.load().runs] == ["eve"]
+        second = Session(store, session=8)
+        assert m.Welcome(8, 8) in returned(second, 100, 8)
+        assert keyframes_of(store, 100) == {8, 9}
+
+
+def test_removed_keyframes_at_the_end_of_a_run_are_not_requested_again(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 20)
+        session.run("eve", 101, 1)
+        atlas, eve = session.mapper.atlas, f"eve-{m.public_tag(100)[:4]}"
+        newest = {(eve, k) for k in range(8, 20)}
+        session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in newest])
+        session.handle(Tick())
+        assert keyframes_of(store, 100) == set(range(8))
+        second = Session(store, session=8)
+        assert m.Welcome(8, 20) in returned(second, 100, 20)
+        assert keyframes_of(store, 100) == {*range(8), 20, 21}
+        assert second.edge.report({})["agents"]["eve"]["suspect_keyframes"] == 0
+
+
+def test_a_forgotten_run_that_only_pings_is_asked_for_a_hello(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 8)
+        emptied(session, 100)
+        for run_id, answered in ((100, 0), (999, 7)):  # 999: never joined
+            session.tell(run_id, m.Ping(1, 0))
+            pong = session.sent[-1]
+            assert isinstance(pong, m.Pong) and pong.session == answered
+        returned(session, 100, 8)
+        session.tell(100, m.Ping(2, 0))
+        pong = session.sent[-1]
+        assert isinstance(pong, m.Pong) and pong.session == 7
+
+
+def test_corrections_of_a_run_that_returns_are_newer_than_those_before(tmp_path: Path) -> None:
+    """Its agent has not noticed, and leaves out corrections that seem older."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.tell(100, hello_of("eve", 100))
+        for session_run in range(2):
+            if session_run:
+                returned(session, 100, 1)
+            else:
+                session.run("eve", 100, 1, stays=True)
+            key = f"eve-{m.public_tag(100)[:4]}"
+            event = map_assignment(key, f"{key}/0", np.eye(4), 2 * session_run)
+            for _ in range(3 - 2 * session_run):
+                session.handle(ed.MapperResult((event,)))
+            session.tell(100, m.Bye())
+            emptied(session, 100)
+            session.now_ns += 100 * S
+    revisions = [one.revision for one in session.sent if isinstance(one, m.Correction)]
+    assert revisions == [4]
 
 
 def test_a_run_that_returns_before_it_is_removed_continues(tmp_path: Path) -> None:
