@@ -59,9 +59,7 @@ class MapGraph:
         self.covariance_scales: dict[str, float] = {}
         self.unsolved_maps: dict[int, None] = {}  # reference segments, longest unsolved first
         self._joins_changed = False  # `loop_counts` has other pairs than at the last `update_maps`
-        self._maps: dict[int, list[int]] = {}
-        self._maps_state: tuple[int, int] | None = None  # of what `_maps` follows from
-        self._maps_version = 0  # of the reference segments
+        self._maps: dict[int, list[int]] | None = {}  # as `maps` returned them; None: to be made anew
 
     def add_keyframe(
         self, agent: str, keyframe: Keyframe, cov: F64, gravity_factor: F64, rank: int = 0
@@ -258,15 +256,29 @@ class MapGraph:
     def maps(self) -> Mapping[int, Sequence[int]]:
         """Return the segments of each map that have keyframes, in order of precedence, by reference
         segment."""
-        state = self.odometry.live_version, self._maps_version
-        if state != self._maps_state:
-            maps: dict[int, list[int]] = {}
-            for segment in sorted(self.odometry.live_segments):
+        live, changed = self.odometry.live_segments, self.odometry.changed_segments
+        if (maps := self._maps) is None:
+            maps = self._maps = {}
+            for segment in sorted(live):
                 maps.setdefault(self.reference_segments[segment], []).append(segment)
             for segments in maps.values():
                 segments.sort(key=self.rank)
-            self._maps, self._maps_state = maps, state
-        return self._maps
+        else:
+            for segment in dict.fromkeys(changed):
+                self._update_map(maps, segment, segment in live)
+        changed.clear()
+        return maps
+
+    def _update_map(self, maps: dict[int, list[int]], segment: int, is_live: bool) -> None:
+        """Add a segment to its map, or remove it."""
+        reference_segment = self.reference_segments[segment]
+        segments = [s for s in maps.get(reference_segment, ()) if s != segment]
+        if is_live:
+            maps[reference_segment] = sorted([*segments, segment], key=self.rank)
+        elif segments:
+            maps[reference_segment] = segments
+        else:
+            maps.pop(reference_segment, None)
 
     def map_sizes(self) -> dict[str, int]:
         """Return how many keyframes each map has, by its name."""
@@ -318,7 +330,7 @@ class MapGraph:
         nothing while the same segments are connected."""
         if not self._joins_changed:
             return
-        self._joins_changed, self._maps_version = False, self._maps_version + 1
+        self._joins_changed, self._maps = False, None
         root = list(range(len(self.reference_segments)))
 
         def find(i: int) -> int:

@@ -50,14 +50,15 @@ class Segment:
 class OdometrySegments:
     """Nodes by id, in order of arrival, and the segments that they form, oldest first.
 
-    live_segments: those that still have nodes. live_version: changes with them.
+    live_segments: those that still have nodes. changed_segments: that were added to them or removed since the
+    reader (`MapGraph.maps`) cleared it.
     """
 
     def __init__(self) -> None:
         self.nodes: dict[int, Node] = {}
         self.segments: list[Segment] = []
         self.live_segments: dict[int, None] = {}
-        self.live_version = 0
+        self.changed_segments: list[int] = []
         self._live_counts = Counter[str]()  # live segments by agent
         self._next_id = 0
         self._node_ids: dict[KeyframeKey, int] = {}
@@ -114,7 +115,7 @@ class OdometrySegments:
         del self._node_ids[node.key]
 
     def _mark_live(self, segment: int, is_live: bool) -> None:
-        self.live_version += 1
+        self.changed_segments.append(segment)
         self._live_counts[self.segments[segment].agent] += 1 if is_live else -1
         if is_live:
             self.live_segments[segment] = None
