@@ -149,14 +149,11 @@ class KeyframeSearch:
 
     def _find(self, request: FindKeyframe) -> Job:
         """Describe -> query -> verify the first candidates. The answer comes with the last step's events."""
-        answered = len(self._answers)
         try:
             yield from self._look_up(request)
         except Exception:
             self._answers.append(KeyframeSought(request.key, None))
             raise
-        if len(self._answers) == answered:
-            self._answers.append(KeyframeSought(request.key, None))
 
     def _look_up(self, request: FindKeyframe) -> Job:
         keyframe, image, view = request.keyframe, None, request.keyframe.view
@@ -167,14 +164,15 @@ class KeyframeSearch:
                 yield []
         query = CameraView(view, request.rig.cam0.focal, request.rig.T_body_cam0, keyframe.up)
         found = yield QueryStep(self._views.index, NO_NODE, query, self._max_candidates, ())
-        candidates = deque(one.id for one in found[:_MAX_CHECKED] if one.id in self._views.by_node)
         place = None
-        while place is None and candidates:
-            yield []
-            if (candidate := candidates.popleft()) in self._views.by_node:
-                images = image, self._views.image(candidate)
-                outcome = yield VerifyStep(NO_NODE, query, candidate, self._views.by_node[candidate], *images)
-                place = self._place(candidate, outcome)
+        for candidate in [one.id for one in found[:_MAX_CHECKED]]:
+            if candidate not in self._views.by_node:
+                continue  # removed meanwhile
+            images = image, self._views.image(candidate)
+            step = VerifyStep(NO_NODE, query, candidate, self._views.by_node[candidate], *images)
+            yield []  # events of the step before; then the candidate may be removed
+            if (place := self._place(candidate, (yield step))) is not None:
+                break
         self._answers.append(KeyframeSought(request.key, place))
         yield []
 
