@@ -8,16 +8,16 @@ from pathlib import Path
 
 import click
 
-from share.cli import options
+from share.cli import edge_options, options
 from share.cli.blind_edge import condition_text, edge_settings
-from share.cli.edge_output import open_map, print_event, print_keys, run_summary
+from share.cli.edge_output import open_map, print_access, print_event, run_summary
 from share.cli.edge_pages import EdgePages, PageOptions, edge_access
 from share.config import STREAMED
 from share.errors import UsageError
 
 
 @click.command()
-@click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
+@edge_options.bind
 @options.policy
 @click.option(
     "--blind",
@@ -32,9 +32,7 @@ from share.errors import UsageError
     type=options.PATH,
     help="Keep the map in this file; continue with what it holds.",
 )
-@click.option(
-    "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
-)
+@edge_options.http
 @click.option("--view", metavar="[H:]P", help="Show the room live in 3D here (needs viser).")
 @click.option(
     "--headset",
@@ -56,21 +54,9 @@ from share.errors import UsageError
     help="Where the headset of agent NAME sits on its device: headset.yaml of share calibrate headset. May "
     "be repeated.",
 )
-@click.option(
-    "--http-token",
-    metavar="FILE",
-    type=options.PATH,
-    help="Ask for the token in this file, made if it is not there; needed to serve other machines.",
-)
-@click.option(
-    "--allow",
-    "allow",
-    type=click.Choice(["commands", "objects"]),
-    multiple=True,
-    help="Without keys: what all on this machine may do: commands (send robots), objects (place them). "
-    "May be repeated.",
-)
-@click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
+@edge_options.http_token
+@edge_options.allow
+@edge_options.out
 @options.config
 @options.verbose
 @options.as_json
@@ -134,9 +120,7 @@ def edge(
         pages.run = stack.enter_context(closing(run))
         with stop_on_signal(run.stop):
             stderr.print_line(f"listening on {link.endpoint}, {condition_text(settings, blinding)}")
-            print_keys(stderr, edge_key_pair)
-            if allowed:
-                stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")
+            print_access(stderr, edge_key_pair, allowed)
             pages.print_addresses()
             report = run.run()
     click.echo(json.dumps(report) if as_json else run_summary(report))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +33,13 @@ def open_map(stderr: Stderr, path: Path) -> MapStore:
     return store
 
 
-def print_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
-    """Print the edge's key and whose it knows, where it has keys."""
+def print_access(stderr: Stderr, keys: EdgeKeys | None, allowed: Collection[str]) -> None:
+    """Print the edge's key and the names that it has authorized, or without keys what everybody may do."""
     if keys is not None:
         names = ", ".join(sorted(keys.allowed.names_by_key().values()))
         stderr.print_line(f"public key '{keys.own.public}'; authorized: {names or 'none yet'}")
+    if allowed:
+        stderr.print_line(f"every program on this machine is allowed {' and '.join(sorted(allowed))}")
 
 
 _SHOWN_EVENTS: set[EventKind] = {  # without -v

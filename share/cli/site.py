@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from share.cli import options
+from share.cli import edge_options, options
 from share.config import STREAMED
 from share.errors import UsageError
 
@@ -27,27 +27,13 @@ if TYPE_CHECKING:
 @click.option(
     "--rooms", "rooms_file", metavar="FILE", type=options.PATH, required=True, help="The rooms, see above."
 )
-@click.option("--bind", default="tcp://127.0.0.1:5555", metavar="tcp://H:P", help="Address to listen on.")
+@edge_options.bind
 @options.policy
 @options.keys
-@click.option(
-    "--http", metavar="[H:]P", help="Serve a status page, /health, /metrics and /snapshot.json here."
-)
-@click.option(
-    "--http-token",
-    metavar="FILE",
-    type=options.PATH,
-    help="Ask for the token in this file, made if it is not there; needed to serve other machines.",
-)
-@click.option(
-    "--allow",
-    "allow",
-    type=click.Choice(["commands", "objects"]),
-    multiple=True,
-    help="Without keys: what all on this machine may do: commands (send robots), objects (place them). "
-    "May be repeated.",
-)
-@click.option("--out", metavar="DIR", type=options.PATH, help="Folder for events.jsonl and edge.json.")
+@edge_options.http
+@edge_options.http_token
+@edge_options.allow
+@edge_options.out
 @options.config
 @options.verbose
 @options.as_json
@@ -66,9 +52,9 @@ def site(
 ) -> None:
     """Serve several rooms at one address, each with a map of its own, until Ctrl-C.
 
-    An agent begins in the room where it was last, else in the first that it may enter. Whoever walks into
-    another room is found there by what its camera sees, and goes on in that room's map; the agent does not
-    reconnect, and loses no keyframe.
+    An agent that reconnects goes on in its room; a new one begins in the first that it may enter. Whoever
+    walks into another room is found there by what its camera sees, and goes on in that room's map; the agent
+    does not reconnect, and loses no keyframe.
 
     \b
     A rooms file, in YAML:
@@ -86,7 +72,7 @@ def site(
     """
     from contextlib import ExitStack, closing
 
-    from share.cli.edge_output import print_event, print_keys, run_summary
+    from share.cli.edge_output import print_access, print_event, run_summary
     from share.cli.edge_pages import EdgePages, PageOptions
     from share.cli.stderr import Stderr
     from share.net.keys import allowed_without_keys, edge_keys_for
@@ -116,7 +102,7 @@ def site(
         with stop_on_signal(run.stop):
             names = ", ".join(f"'{name}'" for name in plan.rooms)
             stderr.print_line(f"listening on {link.endpoint}, policy {settings.edge.policy}, rooms {names}")
-            print_keys(stderr, key_pair)
+            print_access(stderr, key_pair, allowed)
             pages.print_addresses()
             report = run.run()
     click.echo(json.dumps(report) if as_json else run_summary(report))

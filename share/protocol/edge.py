@@ -305,24 +305,21 @@ class EdgeProtocol:
         self._out.record("room changed", peer, f"stays here: room '{room}' refuses it: {reason}")
         return self._out.effects
 
-    def leave_objection(self, key: str) -> str | None:
-        """Return why a run cannot go on in another room now; None if it can."""
+    def may_leave(self, key: str) -> bool:
+        """Return whether a run takes part, and no keyframe of it waits for the disk."""
         peer = self._registry.by_key.get(key)
-        if peer is None or peer.is_gone:
-            return "it is not here"
-        return "keyframes wait for the disk" if peer.pending_saves else None
+        return peer is not None and not peer.is_gone and not peer.pending_saves
 
     def entry_objection(self, peer: Peer, now_ns: int) -> str | None:
         """Return why a run may not come from another room; None if it may."""
         self._out.begin(now_ns)
         return self._membership.entry_objection(peer)
 
-    def hand_over(self, key: str, room: str, now_ns: int) -> tuple[Peer, list[ed.EdgeEffect]]:
-        """Let a run go on in another room; `leave_objection` has none. Return it, and the effects here."""
+    def hand_over(self, peer: Peer, room: str, now_ns: int) -> list[ed.EdgeEffect]:
+        """Let a run that `may_leave` go on in another room. Return the effects here."""
         self._out.begin(now_ns)
-        peer = self._registry.by_key[key]
         self._membership.hand_over(peer, room)
-        return peer, self._out.effects
+        return self._out.effects
 
     def take_over(self, peer: Peer, room: str, place: MapEvent, now_ns: int) -> list[ed.EdgeEffect]:
         """Take in a run that leaves another room; `entry_objection` has none. place: where it was found in a

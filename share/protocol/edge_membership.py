@@ -123,9 +123,7 @@ class RoomMembership:
             return
         peer.is_welcomed, hold_ms = True, self._rate_scheduler.policy.hold_ms(peer.name, self._out.now_ns)
         self._out.send(peer.id, wire.Welcome(peer.session, peer.durable_below, hold_ms))
-        peer.grant = None
-        first = self._rate_scheduler.policy.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
-        self.send_grant(peer, first)
+        self._send_first_grant(peer)
         if peer.last_correction_event is not None:
             self._out.send_correction(peer, peer.last_correction_event, is_repeat=True)
 
@@ -174,7 +172,7 @@ class RoomMembership:
 
     def take_over(self, peer: Peer, room: str) -> None:
         """Take in a run from another room; nothing objects."""
-        peer.entry, peer.grant = RoomEntry(self._out.now_ns + seconds_to_ns(_ENTRY_S)), None
+        peer.entry = RoomEntry(self._out.now_ns + seconds_to_ns(_ENTRY_S))
         was_here = self._registry.take_over(peer)
         change = (
             ed.SetPresence(peer.key, True)
@@ -185,8 +183,7 @@ class RoomMembership:
         self._rate_scheduler.begin_run(peer.name)
         self._out.record("room changed", peer, f"comes from room '{room}'")
         self._make_room(peer)
-        first = self._rate_scheduler.policy.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
-        self.send_grant(peer, first)
+        self._send_first_grant(peer)
 
     def end_entries(self) -> list[MapEvent]:
         """Return the withheld corrections of runs that entered some time ago and are in a map of their
@@ -249,6 +246,11 @@ class RoomMembership:
             if peer.odometry_base is not None:
                 self._out.save(SaveCredential(peer.key, event.credential))
         return True
+
+    def _send_first_grant(self, peer: Peer) -> None:
+        peer.grant = None
+        first = self._rate_scheduler.policy.first_grant(peer.name, peer.hello.kind, self._out.now_ns)
+        self.send_grant(peer, first)
 
     def send_grant(self, peer: Peer, grant: RateGrant | None) -> None:
         """Send what an agent may send, if that has changed; None: everything, which needs no message."""

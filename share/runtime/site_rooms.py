@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from share.config import Config
 from share.event_kinds import EventKind
 from share.mapping.corrections import MapEvent
 from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
-from share.protocol.edge_events import AddKeyframe, EdgeEvent, PeerMessageReceived
+from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
 from share.protocol.peer import Peer
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
@@ -86,9 +86,7 @@ class SiteRooms:
             self.close()
             raise
 
-    def handle(self, event: EdgeEvent) -> None:
-        if not isinstance(event, PeerMessageReceived):
-            raise TypeError(f"{type(event).__name__} concerns one room")
+    def handle(self, event: PeerMessageReceived) -> None:
         room = self._switch.room_of(event.peer_id, event.frames)
         if room is None:
             self._host.send(event.peer_id, encode(Refused(_NO_ROOM)))
@@ -102,7 +100,7 @@ class SiteRooms:
         if setup.names is None:
             return event
         names = setup.names if event.allowed_names is None else setup.names & event.allowed_names
-        return PeerMessageReceived(event.peer_id, event.frames, names, event.credential, event.permissions)
+        return replace(event, allowed_names=names)
 
     def step(self) -> None:
         """Handle the answers of all rooms and of the directory, and the time that has passed."""
@@ -219,18 +217,16 @@ class _Port(RoomPort):
     def run(self, key: str) -> Peer | None:
         return self._room.protocol.run(key)
 
-    def leave_objection(self, key: str) -> str | None:
-        return self._room.protocol.leave_objection(key)
+    def may_leave(self, key: str) -> bool:
+        return self._room.protocol.may_leave(key)
 
     def entry_objection(self, peer: Peer) -> str | None:
         if self._room.is_waiting:
             return "its map cannot be read now"
         return self._room.protocol.entry_objection(peer, time.monotonic_ns())
 
-    def hand_over(self, key: str, room: str) -> Peer:
-        peer, effects = self._room.protocol.hand_over(key, room, time.monotonic_ns())
-        self._room.execute(effects)
-        return peer
+    def hand_over(self, peer: Peer, room: str) -> None:
+        self._room.execute(self._room.protocol.hand_over(peer, room, time.monotonic_ns()))
 
     def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
         self._room.execute(self._room.protocol.take_over(peer, room, place, time.monotonic_ns()))

@@ -41,13 +41,13 @@ class RoomPort(Protocol):
 
     def run(self, key: str) -> Peer | None: ...
 
-    def leave_objection(self, key: str) -> str | None:
-        """Return why a run cannot go on in another room now; None if it can."""
+    def may_leave(self, key: str) -> bool:
+        """Return whether a run takes part, and no keyframe of it waits for the disk."""
 
     def entry_objection(self, peer: Peer) -> str | None:
         """Return why a run may not come from another room; None if it may."""
 
-    def hand_over(self, key: str, room: str) -> Peer:
+    def hand_over(self, peer: Peer, room: str) -> None:
         """Let a run go on in another room."""
 
     def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
@@ -119,10 +119,8 @@ class RoomSwitch:
 
     def add_ranking(self, ranking: RoomRanking, now_ns: int) -> None:
         """Have the rooms search a keyframe that look like it."""
-        peer, keyframe = (
-            self._rooms[ranking.room].run(ranking.key.agent),
-            self._keyframe(ranking.key.agent, ranking.key.id),
-        )
+        peer = self._rooms[ranking.room].run(ranking.key.agent)
+        keyframe = self._keyframe(ranking.key.agent, ranking.key.id)
         if peer is None or peer.is_gone or keyframe is None:
             return
         allowed = tuple(one for one in ranking.scores if self._may_enter(one.room, peer.name))
@@ -156,7 +154,7 @@ class RoomSwitch:
         if room is None or room == found.room or keyframe is None:
             return True
         source, target = self._rooms[room], self._rooms[found.room]
-        if source.leave_objection(run) is not None:
+        if not source.may_leave(run):
             return False
         peer = source.run(run)
         assert peer is not None
@@ -164,7 +162,7 @@ class RoomSwitch:
             source.note_refused_entry(peer, found.room, reason)
             return True
         left, entered = peer.last_correction_event, _entry_event(run, keyframe, found.place)
-        peer = source.hand_over(run, found.room)
+        source.hand_over(peer, found.room)
         target.take_over(peer, room, entered)
         if left is not None and left.correction is not None and entered.correction is not None:
             maps = RoomMap(room, left.correction.map_id), RoomMap(found.room, found.place.map_id)

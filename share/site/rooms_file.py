@@ -8,7 +8,7 @@ from pathlib import Path
 from share.agent_names import checked_name
 from share.config import Config
 from share.errors import ConfigError, UsageError
-from share.files.reading import MB, read_text
+from share.files.reading import MAX_SETTINGS_BYTES, read_errors, read_text
 from share.plain_data import from_mapping
 from share.strict_yaml import load_yaml
 
@@ -17,7 +17,7 @@ _MAX_ROOMS = 500
 
 
 @dataclass(frozen=True)
-class RoomPlan:
+class RoomSpec:
     """One room. map: its file, relative to the rooms file; None: the map is not kept. agents: names that may
     be in it; None: all. max_agents, max_keyframes: as edge.max_agents and edge.max_keyframes."""
 
@@ -38,7 +38,7 @@ class RoomPlan:
 
 @dataclass(frozen=True)
 class _RoomsFile:
-    rooms: dict[str, RoomPlan]
+    rooms: dict[str, RoomSpec]
     schema: int = _SCHEMA
 
 
@@ -46,7 +46,7 @@ class _RoomsFile:
 class SitePlan:
     """The rooms by name; those of whom nothing is known begin in the first. folder: of the rooms file."""
 
-    rooms: dict[str, RoomPlan]
+    rooms: dict[str, RoomSpec]
     folder: Path
 
     def map_file(self, room: str) -> Path | None:
@@ -58,10 +58,9 @@ class SitePlan:
 def read_rooms(path: Path) -> SitePlan:
     """Read a rooms file. Raises UsageError, ConfigError."""
     where = str(path)
-    try:
-        data = load_yaml(read_text(path, MB), where)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    with read_errors(path, UsageError):
+        text = read_text(path, MAX_SETTINGS_BYTES)
+    data = load_yaml(text, where)
     if isinstance(data, dict) and isinstance(rooms := data.get("rooms"), dict):  # some without anything
         data = {**data, "rooms": {room: {} if one is None else one for room, one in rooms.items()}}
     read = from_mapping(_RoomsFile, data, where)
@@ -76,15 +75,15 @@ def read_rooms(path: Path) -> SitePlan:
     return plan
 
 
-def _check_room(room: str, plan: RoomPlan, where: str) -> None:
+def _check_room(room: str, spec: RoomSpec, where: str) -> None:
     try:
-        for name in (room, *(plan.agents or ())):
+        for name in (room, *(spec.agents or ())):
             if checked_name(name) != name:
                 raise ValueError("name: is not composed (NFC)")
-        plan.settings(Config())
+        spec.settings(Config())
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
-    if plan.agents is not None and len(set(plan.agents)) < len(plan.agents):
+    if spec.agents is not None and len(set(spec.agents)) < len(spec.agents):
         raise ConfigError(f"{where}: agents: a name is given twice")
 
 

@@ -41,16 +41,14 @@ class SimRoom(ModelRun):
     def run(self, key: str) -> Peer | None:
         return self.machine.run(key)
 
-    def leave_objection(self, key: str) -> str | None:
-        return self.machine.leave_objection(key)
+    def may_leave(self, key: str) -> bool:
+        return self.machine.may_leave(key)
 
     def entry_objection(self, peer: Peer) -> str | None:
         return self.machine.entry_objection(peer, self._site.now_ns)
 
-    def hand_over(self, key: str, room: str) -> Peer:
-        peer, effects = self.machine.hand_over(key, room, self._site.now_ns)
-        self._site.execute(self, effects)
-        return peer
+    def hand_over(self, peer: Peer, room: str) -> None:
+        self._site.execute(self, self.machine.hand_over(peer, room, self._site.now_ns))
 
     def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
         self._site.execute(self, self.machine.take_over(peer, room, place, self._site.now_ns))
