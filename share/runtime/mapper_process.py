@@ -34,9 +34,23 @@ _SAVE_POSES_S = 5.0  # period of saving all poses
 _EXPIRE_S = 60.0  # period of forgetting old keyframes
 
 
+@dataclass(frozen=True)
+class StartMapper:
+    """First message to the mapper. map_file: where images and views are read. has_other_rooms: a directory
+    of places wants to know what is in the map."""
+
+    settings: Config
+    map_file: Path | None = None
+    has_other_rooms: bool = False
+
+    def mapper(self) -> Mapper:
+        archive = None if self.map_file is None else KeyframeArchive(self.map_file)
+        return Mapper(self.settings, archive, PlaceNewsLog() if self.has_other_rooms else None)
+
+
 @dataclass(frozen=True, eq=False)
 class RestoreMap:
-    """First message to the mapper: the map of an earlier session, as rows of its file.
+    """Second message to the mapper, if any: the map of an earlier session, as rows of its file.
 
     has_keys: agents of this edge have keys.
     """
@@ -53,10 +67,12 @@ class RestoreMap:
 
 @dataclass(frozen=True)
 class MapperReport:
-    """The mapper's report, every second and at the end. solving_s: duration of the current solve so far."""
+    """The mapper's report, every second and at the end. solving_s: duration of the current solve so far.
+    is_idle: it has nothing to do."""
 
     report: dict[str, Any]
     solving_s: float = 0.0
+    is_idle: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,34 +107,30 @@ class _SolveResult:
     ms: float
 
 
-def run_mapper(
-    inbox: Inbox,
-    answer: Callable[[Any], None],
-    settings: Config,
-    map_file: Path | None = None,
-    has_other_rooms: bool = False,
-) -> None:
-    """Work of a `WorkerProcess`: takes RestoreMap, AddRun, SetCredential, SetPresence, AddKeyframe, DropRun
-    and FindKeyframe until END; answers KeyframesAdded, MapperResult, MapperReport, MapRestored, SolverDied
-    and KeyframeSought, and where there are other rooms PlaceNewsBatch. map_file: where images and views are
-    read."""
-    archive = None if map_file is None else KeyframeArchive(map_file)
-    _MapperProcess(inbox, answer, settings, archive, PlaceNewsLog() if has_other_rooms else None).run()
+def start_mapper_process(
+    on_answer: Callable[[Any], None], on_death: Callable[[str], None], start_delay_s: float = 0.0
+) -> WorkerProcess:
+    """Return a mapper's process, which takes a StartMapper first."""
+    return WorkerProcess("mapping", run_mapper, (), on_answer, on_death, start_delay_s)
+
+
+def run_mapper(inbox: Inbox, answer: Callable[[Any], None]) -> None:
+    """Work of a `WorkerProcess`: takes StartMapper, then RestoreMap, AddRun, SetCredential, SetPresence,
+    AddKeyframe, DropRun and FindKeyframe until END; answers KeyframesAdded, MapperResult, MapperReport,
+    MapRestored, SolverDied and KeyframeSought, and where there are other rooms PlaceNewsBatch."""
+    solver = _start_solver(inbox, 0.0)
+    if isinstance(start := inbox.get(), StartMapper):
+        _MapperProcess(inbox, answer, start.mapper(), solver).run()
+    else:  # it was not needed, or its solver has died
+        solver.close()
 
 
 class _MapperProcess:
     def __init__(
-        self,
-        inbox: Inbox,
-        answer: Callable[[Any], None],
-        settings: Config,
-        archive: KeyframeArchive | None,
-        news: PlaceNewsLog | None,
+        self, inbox: Inbox, answer: Callable[[Any], None], mapper: Mapper, solver: WorkerProcess
     ) -> None:
-        self._inbox, self._answer, self._settings = inbox, answer, settings
-        self._mapper = Mapper(settings, archive, news)
+        self._inbox, self._answer, self._mapper, self._solver = inbox, answer, mapper, solver
         self._backoff = Backoff(time.monotonic_ns())
-        self._solver = self._new_solver(0.0)
         self._is_restoring = False
         self._running_solve: SolveStep | None = None
         self._solve_start_s = 0.0
@@ -127,7 +139,7 @@ class _MapperProcess:
         self._report_due_s = self._poses_due_s = self._expire_due_s = 0.0  # monotonic
         self._has_new_poses = False
         self._heap = HeapTrimmer()
-        self._is_ended = False
+        self._is_idle = self._is_ended = False
 
     def run(self) -> None:
         try:
@@ -152,6 +164,7 @@ class _MapperProcess:
             self._send_to_solver()
             self._publish()
             step = self._guarded("lookup", self._mapper.next_lookup, None)
+            self._is_idle = step is None and self._running_solve is None
             if self._is_restoring:  # the mapper has read all restored views by now
                 self._is_restoring = False
                 self._answer(MapRestored())
@@ -232,19 +245,12 @@ class _MapperProcess:
         if step is not None:
             self._map_events += self._mapper.finish_step(step, result, ms)
 
-    def _new_solver(self, start_delay_s: float) -> WorkerProcess:
-        return WorkerProcess("solver", run_solver, (), self._inbox.put, self._post_solver_died, start_delay_s)
-
-    def _post_solver_died(self, reason: str) -> None:
-        """Called from another thread."""
-        self._inbox.put(_SolverProcessDied(reason))
-
     def _restart_solver(self, reason: str) -> None:
         """Start a new solver; the current solution is lost and the whole graph is sent again."""
         self._solver.close()
         pause_s = self._backoff.record_failure(time.monotonic_ns())
         self._answer(SolverDied(f"its process {reason}; restarted in {pause_s:g} s"))
-        self._solver = self._new_solver(pause_s)
+        self._solver = _start_solver(self._inbox, pause_s)
         self._mapper.reset_solver()
         self._finish_solve(RuntimeError(f"the solver {reason}"), 0.0)
 
@@ -264,8 +270,15 @@ class _MapperProcess:
         if time.monotonic() >= self._report_due_s:
             self._report_due_s = time.monotonic() + _REPORT_S
             solving_s = 0.0 if self._running_solve is None else time.monotonic() - self._solve_start_s
-            self._answer(MapperReport(self._mapper.report(), solving_s))
+            self._answer(MapperReport(self._mapper.report(), solving_s, self._is_idle))
             self._heap.trim_if_due(time.monotonic())
+
+
+def _start_solver(mapper_inbox: Inbox, start_delay_s: float) -> WorkerProcess:
+    def post_death(reason: str) -> None:  # from another thread
+        mapper_inbox.put(_SolverProcessDied(reason))
+
+    return WorkerProcess("solver", run_solver, (), mapper_inbox.put, post_death, start_delay_s)
 
 
 def run_solver(inbox: Inbox, answer: Callable[[Any], None]) -> None:

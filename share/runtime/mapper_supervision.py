@@ -120,12 +120,14 @@ class MapperProgress:
 
     def __init__(self) -> None:
         self.report: dict[str, Any] = {}
+        self.is_idle = False  # the mapper has nothing to do
         self._reported_s: float | None = None  # monotonic, as below
         self._solving_s = 0.0  # duration of the current solve at that time
         self._solved_s: float | None = None
 
     def record(self, report: MapperReport) -> None:
         self._reported_s, self._solving_s = time.monotonic(), report.solving_s
+        self.is_idle = report.is_idle
         if _solve_count(report.report) > _solve_count(self.report):
             self._solved_s = self._reported_s
         self.report = report.report

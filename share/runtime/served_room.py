@@ -12,7 +12,7 @@ from __future__ import annotations
 import queue
 import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -56,7 +56,8 @@ from share.runtime.mapper_process import (
     PlaceNewsBatch,
     RestoreMap,
     SolverDied,
-    run_mapper,
+    StartMapper,
+    start_mapper_process,
 )
 from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
@@ -66,6 +67,9 @@ from share.store.map_store import MapStore
 from share.wire.layouts import Bytes
 
 _DRAIN_S = 0.5  # wait for the map writer of a session that is over
+
+
+StartProcess = Callable[[Callable[[Any], None], Callable[[str], None], float], WorkerProcess]
 
 
 class RoomHost(Protocol):
@@ -119,8 +123,8 @@ class _MapperDied:
 class ServedRoom:
     """A room, until `close`.
 
-    start_ns: origin of the times in events. has_keys: agents have keys. Raises StoreError if the map in
-    `store` is unreadable.
+    start_ns: origin of the times in events. has_keys: agents have keys. totals: of the room's earlier
+    sessions. Raises StoreError if the map in `store` is unreadable.
     """
 
     def __init__(
@@ -133,6 +137,8 @@ class ServedRoom:
         blinding: Blinding | NoBlinding,
         has_keys: bool,
         others: OtherRooms | None = None,
+        totals: SessionTotals | None = None,
+        start_mapper: StartProcess = start_mapper_process,
     ) -> None:
         self._settings, self._host, self._start_ns = settings, host, start_ns
         self._observer, self._blinding, self._others = observer, blinding, others
@@ -143,7 +149,8 @@ class ServedRoom:
         self._stopping = False
         self._troubles = RecentTroubles()
         self._other_troubles = RecentTroubles()  # of one agent or map, not of the edge
-        self._totals = SessionTotals()
+        self._start_mapper = start_mapper
+        self._totals = totals or SessionTotals()
         self._start_session(self._load_stored_map())
 
     def handle(self, event: EdgeEvent) -> None:
@@ -151,7 +158,7 @@ class ServedRoom:
 
     def step(self) -> None:
         """Handle the answers of the room's processes and threads, and the time that has passed."""
-        self._handle_answers()
+        self.handle_answers()
         self.handle(Tick())
         if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
             self._restart_mapping(self._restart_reason)
@@ -162,19 +169,36 @@ class ServedRoom:
 
     def close(self) -> str | None:
         """End all processes and threads. Return why the map file is incomplete, None if it is complete."""
+        self.end_processes()
+        self.handle_answers()
+        incomplete_reason = self.close_file()
+        self.finish(incomplete_reason)
+        return incomplete_reason
+
+    # The parts of `close`, for a loop that must not wait: a thread calls the first and the third.
+
+    def end_processes(self) -> None:
+        """End all processes after they have answered all messages."""
         self._stopping = True
         if self._mapper_process is not None:
             self._handover.flush()
             self._mapper_process.close()
-        self._handle_answers()
         self._trackers.close()
-        if self._map_writer is None:
-            return None
-        incomplete_reason = self._map_writer.close()
-        self._handle_answers()  # acknowledges what has been saved
+
+    def handle_answers(self) -> None:
+        """Handle the answers of the room's processes and threads."""
+        while not self._inbox.empty():
+            self._handle_answer(self._inbox.get())
+
+    def close_file(self) -> str | None:
+        """Close the map file. Return why it is incomplete, None if it is complete."""
+        return None if self._map_writer is None else self._map_writer.close()
+
+    def finish(self, incomplete_reason: str | None) -> None:
+        """Acknowledge what has been saved at the end."""
+        self.handle_answers()
         if incomplete_reason is not None:
             self._log_map(incomplete_reason)
-        return incomplete_reason
 
     # ------------------------------------------------------------------ what other rooms need
 
@@ -182,6 +206,12 @@ class ServedRoom:
     def protocol(self) -> EdgeProtocol:
         """The state machine of the present session; `execute` carries out what it returns."""
         return self._state_machine
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nobody takes part, all is in the map file, and the mapper has nothing to do."""
+        is_saved = self._map_writer is not None and not self._map_writer.pending_changes
+        return self._state_machine.is_empty and is_saved and self._progress.is_idle and not self.is_waiting
 
     @property
     def is_waiting(self) -> bool:
@@ -210,8 +240,7 @@ class ServedRoom:
 
     def report(self) -> dict[str, Any]:
         """Return edge.json without `series` and what only the edge around the room knows."""
-        totals = self._totals.with_totals(self._state_machine.report(self._progress.report))
-        report = self._blinding.covered(totals)
+        report = self._blinding.covered(self._raw_report())
         map_trouble = None if self._map_writer is None else self._map_writer.trouble
         return {
             **report,
@@ -222,6 +251,14 @@ class ServedRoom:
             **self._progress.last_solve(),
             **self._restarts.loading(),
         }
+
+    def end_totals(self) -> SessionTotals:
+        """Return the totals with those of the present session, at its end."""
+        self._totals.add_session(self._raw_report())
+        return self._totals
+
+    def _raw_report(self) -> dict[str, Any]:
+        return self._totals.with_totals(self._state_machine.report(self._progress.report))
 
     # ------------------------------------------------------------------ sessions
 
@@ -264,10 +301,9 @@ class ServedRoom:
         if self._others is not None:
             self._others.note_session()
         has_others = self._others is not None
-        arguments = (self._settings, None if store is None else store.path, has_others)
-        self._mapper_process = WorkerProcess(
-            "mapping", run_mapper, arguments, self._post, self._post_mapper_died, start_delay_s
-        )
+        map_file = None if store is None else store.path
+        self._mapper_process = self._start_mapper(self._post, self._post_mapper_died, start_delay_s)
+        self._mapper_process.send(StartMapper(self._settings, map_file, has_others))
         if restore is not None:
             self._mapper_process.send(restore)
         self._handover = KeyframeHandover(self._mapper_process.send)
@@ -288,8 +324,7 @@ class ServedRoom:
             self._discard_answers()
             self._restarts.objects = self._state_machine.room.kept_objects()
             loaded = self._load_stored_map()
-            report = self._state_machine.report(self._progress.report)
-            self._totals.add_session(self._totals.with_totals(report))
+            self.end_totals()
             self._start_session(loaded, pause_s)
             self._restart_due_s = None
         except StoreError as error:  # until it can be read, nothing is applied or acknowledged
@@ -298,36 +333,35 @@ class ServedRoom:
 
     # ------------------------------------------------------------------ answers and effects
 
-    def _handle_answers(self) -> None:
-        while not self._inbox.empty():
-            match self._inbox.get():
-                case MapperResult() as result:
-                    self.handle(result)
-                    self._observer.add_result(result)
-                case ChangesSaved() | TrackerReady() | TrackerAnswered() as answer:
-                    self.handle(answer)
-                case TrackerLost() as tracker if not self._stopping:
-                    text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
-                    self._other_troubles.add(text)
-                    self.handle(tracker)
-                case KeyframesAdded() as added:
-                    self._handover.record_added(added)
-                case MapperReport() as report:
-                    self._progress.record(report)
-                case PlaceNewsBatch() as batch if self._others is not None:
-                    self._others.note_places(batch.news)
-                case KeyframeSought() as sought if self._others is not None:
-                    self._others.note_sought(sought)
-                case _MapNotice() as notice:
-                    self._log_map(notice.text)
-                case MapRestored():
-                    self._restarts.record_restored()
-                    self._host.expect_growth(False)
-                case SolverDied() as solver:
-                    self._host.log_event("solver died", solver.text)
-                    self._troubles.add(f"the solver: {solver.text}")
-                case _MapperDied() as mapper if not self._stopping:
-                    self._restart_mapping(f"its process {mapper.reason}")
+    def _handle_answer(self, answer: object) -> None:
+        match answer:
+            case MapperResult() as result:
+                self.handle(result)
+                self._observer.add_result(result)
+            case ChangesSaved() | TrackerReady() | TrackerAnswered() as event:
+                self.handle(event)
+            case TrackerLost() as tracker if not self._stopping:
+                text = f"agent's run {tracker.key}: its tracker {tracker.reason}"
+                self._other_troubles.add(text)
+                self.handle(tracker)
+            case KeyframesAdded() as added:
+                self._handover.record_added(added)
+            case MapperReport() as report:
+                self._progress.record(report)
+            case PlaceNewsBatch() as batch if self._others is not None:
+                self._others.note_places(batch.news)
+            case KeyframeSought() as sought if self._others is not None:
+                self._others.note_sought(sought)
+            case _MapNotice() as notice:
+                self._log_map(notice.text)
+            case MapRestored():
+                self._restarts.record_restored()
+                self._host.expect_growth(False)
+            case SolverDied() as solver:
+                self._host.log_event("solver died", solver.text)
+                self._troubles.add(f"the solver: {solver.text}")
+            case _MapperDied() as mapper if not self._stopping:
+                self._restart_mapping(f"its process {mapper.reason}")
 
     def _discard_answers(self) -> None:
         """Drop answers to a session that is over; log only its notices."""

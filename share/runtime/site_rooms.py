@@ -19,12 +19,15 @@ from share.event_kinds import EventKind
 from share.mapping.corrections import MapEvent
 from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
+from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import Peer
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.fault_guard import FaultGuard
 from share.runtime.output_writer import JobThread
+from share.runtime.room_keeper import IDLE_S, RoomKeeper
 from share.runtime.served_room import RoomHost, ServedRoom
+from share.runtime.spare_mapper import SpareMapper
 from share.site.building import RoomMap
 from share.site.directory import PlaceDirectory, RoomRanking
 from share.site.report import site_report
@@ -56,35 +59,65 @@ class RoomSetup:
 
 class SiteRooms:
     """The rooms of a site, until `close`; has the interface of one `ServedRoom`. Those of whom nothing is
-    known begin in the first room. Raises StoreError if the map of a room is unreadable."""
+    known begin in the first room. idle_s: see `RoomKeeper`. Raises StoreError if the map of a room is
+    unreadable."""
 
-    def __init__(self, host: RoomHost, setups: Sequence[RoomSetup], start_ns: int, has_keys: bool) -> None:
+    def __init__(
+        self,
+        host: RoomHost,
+        setups: Sequence[RoomSetup],
+        start_ns: int,
+        has_keys: bool,
+        idle_s: float = IDLE_S,
+    ) -> None:
         self._host, self._setups = host, {setup.name: setup for setup in setups}
         self._directory, self._thread = PlaceDirectory(), JobThread("directory")
         self._rankings: queue.SimpleQueue[RoomRanking] = queue.SimpleQueue()
         self._growing: set[str] = set()
+        self._spare = SpareMapper()
         self._maps_due_s = 0.0  # monotonic
         self._refusals = Throttle(1.0, 5.0)
         self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
-        self._rooms: dict[str, ServedRoom] = {}
+        self._rooms: dict[str, RoomKeeper] = {}
         self._ports: dict[str, RoomPort] = {}
         self._switch = RoomSwitch(self._ports, lambda room, name: self._setups[room].allows(name))
         try:
             for name, setup in self._setups.items():
-                self._rooms[name] = ServedRoom(
-                    setup.settings,
-                    _RoomHost(name, host, self),
-                    start_ns,
-                    setup.store,
-                    setup.observer,
-                    NoBlinding(),
-                    has_keys,
-                    _Neighbour(name, self),
-                )
+                room_host = _RoomHost(name, host, self)
+                serve = partial(self._serve, setup, room_host, start_ns, has_keys)
+                notify = partial(room_host.log_event, "map")
+                self._rooms[name] = RoomKeeper(setup.store, serve, notify, host.wake, idle_s)
                 self._ports[name] = _Port(self._rooms[name])
         except BaseException:
             self.close()
             raise
+        if any(setup.store is not None for setup in setups):
+            self._spare.prepare()
+
+    def _serve(
+        self,
+        setup: RoomSetup,
+        host: RoomHost,
+        start_ns: int,
+        has_keys: bool,
+        store: MapStore | None,
+        totals: SessionTotals,
+        is_unchanged: bool,
+    ) -> ServedRoom:
+        """Start a room. is_unchanged: the directory knows what its map file holds."""
+        neighbour = _Neighbour(setup.name, self, is_unchanged)
+        return ServedRoom(
+            setup.settings,
+            host,
+            start_ns,
+            store,
+            setup.observer,
+            NoBlinding(),
+            has_keys,
+            neighbour,
+            totals,
+            self._spare.take,
+        )
 
     def handle(self, event: PeerMessageReceived) -> None:
         room = self._switch.room_of(event.peer_id, event.frames)
@@ -131,6 +164,7 @@ class SiteRooms:
             if (reason := room.close()) is not None:
                 reasons.append(f"room '{name}': {reason}")
         self._thread.stop(_TIMEOUT_S)
+        self._spare.close()
         return "; ".join(reasons) or None
 
     # ------------------------------------------------------------------ what is shown
@@ -205,48 +239,57 @@ class _RoomHost:
 class _Port(RoomPort):
     """What the switch asks of one room."""
 
-    def __init__(self, room: ServedRoom) -> None:
-        self._room = room
+    def __init__(self, keeper: RoomKeeper) -> None:
+        self._keeper = keeper
 
     def knows(self, peer_id: bytes) -> int | None:
-        return self._room.protocol.knows(peer_id)
+        return self._keeper.knows(peer_id)
 
     def is_present(self, name: str) -> bool:
-        return self._room.protocol.is_present(name)
+        return (protocol := self._keeper.protocol) is not None and protocol.is_present(name)
 
     def run(self, key: str) -> Peer | None:
-        return self._room.protocol.run(key)
+        return None if (protocol := self._keeper.protocol) is None else protocol.run(key)
 
     def may_leave(self, key: str) -> bool:
-        return self._room.protocol.may_leave(key)
+        return (protocol := self._keeper.protocol) is not None and protocol.may_leave(key)
 
     def entry_objection(self, peer: Peer) -> str | None:
-        if self._room.is_waiting:
+        room = self._keeper.room
+        if room is None or room.is_waiting:
             return "its map cannot be read now"
-        return self._room.protocol.entry_objection(peer, time.monotonic_ns())
+        return room.protocol.entry_objection(peer, time.monotonic_ns())
 
     def hand_over(self, peer: Peer, room: str) -> None:
-        self._room.execute(self._room.protocol.hand_over(peer, room, time.monotonic_ns()))
+        served = self._awake()
+        served.execute(served.protocol.hand_over(peer, room, time.monotonic_ns()))
 
     def take_over(self, peer: Peer, room: str, place: MapEvent) -> None:
-        self._room.execute(self._room.protocol.take_over(peer, room, place, time.monotonic_ns()))
+        served = self._awake()
+        served.execute(served.protocol.take_over(peer, room, place, time.monotonic_ns()))
 
     def find(self, request: FindKeyframe) -> None:
-        self._room.find(request)
+        self._keeper.find(request)
 
     def note_refused_entry(self, peer: Peer, room: str, reason: str) -> None:
-        effects = self._room.protocol.note_refused_entry(peer, room, reason, time.monotonic_ns())
-        self._room.execute(effects)
+        served = self._awake()
+        served.execute(served.protocol.note_refused_entry(peer, room, reason, time.monotonic_ns()))
+
+    def _awake(self) -> ServedRoom:
+        assert self._keeper.room is not None  # a run takes part in it, or may enter
+        return self._keeper.room
 
 
 class _Neighbour:
-    """What one room tells of itself, with its name."""
+    """What one room tells of itself, with its name. keeps_places: the directory knows its first session."""
 
-    def __init__(self, room: str, site: SiteRooms) -> None:
-        self._room, self._site = room, site
+    def __init__(self, room: str, site: SiteRooms, keeps_places: bool) -> None:
+        self._room, self._site, self._keeps_places = room, site, keeps_places
 
     def note_session(self) -> None:
-        self._site.begin_session(self._room)
+        if not self._keeps_places:
+            self._site.begin_session(self._room)
+        self._keeps_places = False
 
     def note_keyframe(self, added: AddKeyframe) -> None:
         self._site.add_keyframe(added)

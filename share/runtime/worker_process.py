@@ -38,6 +38,8 @@ class WorkerProcess:
     ) -> None:
         self.name = name
         self._on_answer, self._on_death = on_answer, on_death
+        self._attaching = threading.Lock()
+        self._death_reason: str | None = None
         self._closing = threading.Event()
         self._starting = threading.Lock()
         self._start_error: str | None = None
@@ -67,6 +69,19 @@ class WorkerProcess:
                 except OSError as error:  # no memory, too many processes
                     self._start_error = error.strerror or str(error)
             self._child_end.close()
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether it has ended without being asked to."""
+        return self._death_reason is not None
+
+    def attach(self, on_answer: Callable[[Any], None], on_death: Callable[[str], None]) -> None:
+        """Replace who gets the answers. A process that has died meanwhile is reported again."""
+        with self._attaching:
+            self._on_answer, self._on_death = on_answer, on_death
+            reason = self._death_reason
+        if reason is not None:
+            on_death(reason)
 
     def send(self, message: Any) -> None:
         self._outbox.put(message)
@@ -101,10 +116,14 @@ class WorkerProcess:
     def _receive_loop(self) -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
-                self._on_answer(self._parent_end.recv())
+                answer = self._parent_end.recv()
+                self._on_answer(answer)  # of who waits now, see `attach`
         if not self._closing.is_set():
             self._outbox.put(END)
-            self._on_death(self._describe_exit())
+            reason = self._describe_exit()
+            with self._attaching:
+                self._death_reason, on_death = reason, self._on_death
+            on_death(reason)
 
     def _describe_exit(self) -> str:
         if self._start_error is not None:

@@ -13,7 +13,7 @@ from share.site.building import BuildingPose, RoomMap
 _LINES = "refused", "trouble", "degraded", "agent_trouble"
 _BY_NAME = "maps", "objects", "robots"
 _COUNTS = "waiting", "failed_steps", "removed_keyframes", "internal_errors", "forgotten_runs"
-_ROOM_FIELDS = "session", "policy", "loading", "last_solve_s", "loops", "merges", *_COUNTS
+_ROOM_FIELDS = "session", "policy", "asleep", "loading", "last_solve_s", "loops", "merges", *_COUNTS
 
 
 def site_report(

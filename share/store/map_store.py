@@ -43,6 +43,7 @@ class MapStore:
     def __init__(self, path: Path, opened: OpenedMap, reason: str) -> None:
         self.path, self.read_only_reason, self.problems = path, reason, opened.problems
         self._opened: ReadRows | None = opened.rows  # None: outdated
+        self._outline: StoredMap | None = None  # of `_opened`
         self._db: sqlite3.Connection | None = None
         self._file_ids: dict[Path, tuple[int, int]] = {}  # device and inode of the map's files
         self._lock: int | None = None
@@ -108,7 +109,7 @@ class MapStore:
     def _write(self, new_changes: Sequence[MapChange]) -> None:
         db = self._writable_db()
         self._check_in_place()
-        self._opened = None
+        self._opened = self._outline = None
         try:
             db.execute("BEGIN IMMEDIATE")
             for change in new_changes:
@@ -170,7 +171,7 @@ class MapStore:
             renamed = salvage(self.path)[1]
             self.problems = (*self.problems, damage_text(renamed))
         finally:
-            self._opened = None
+            self._opened = self._outline = None
             self._start_writing()
 
     def _start_writing(self) -> None:
@@ -178,7 +179,7 @@ class MapStore:
         database.create_private(self.path)
         self._db = open_writer(self.path, self._durable, time.time())
         if self._db.total_changes:
-            self._opened = None
+            self._opened = self._outline = None
         self._file_ids = _read_file_ids(self.path)
 
     def image_bytes(self, keys: Iterable[KeyframeKey]) -> int:
@@ -191,7 +192,10 @@ class MapStore:
 
     def outline(self) -> StoredMap:
         """Return what runs continue from (`outline_map`). Raises StoreError."""
-        return outline_map(self.rows())
+        if self._opened is None:
+            return outline_map(self.rows())
+        self._outline = self._outline or outline_map(self._opened)
+        return self._outline
 
     def load(self) -> StoredMap:
         """Return the whole map, but images and views (`KeyframeArchive`). Raises StoreError."""
@@ -216,7 +220,7 @@ class MapStore:
         try:
             return set_aside(self.path)
         finally:
-            self._opened = None
+            self._opened = self._outline = None
             self._start_writing()
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ from share.config import Config
 from share.mapping.mapper import Mapper
 from share.protocol.edge_events import AddKeyframe, AddRun, MapperResult
 from share.runtime import mapper_process
-from share.runtime.mapper_process import run_mapper
+from share.runtime.mapper_process import StartMapper, run_mapper
 from share.runtime.worker_process import END
 from share.types import Keyframe, View
 
@@ -46,6 +46,7 @@ def test_an_agent_with_many_keyframes_delays_only_itself(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Mapper, "add_keyframe", record)
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    inbox.put(StartMapper(Config()))
     for name, run in (("eve", "eve-1"), ("eve", "eve-2"), ("ann", "ann-1")):
         inbox.put(AddRun(run, hello_of(name, 1)))
     for run, count in (("eve-1", 40), ("eve-2", 40), ("ann-1", 3)):
@@ -53,7 +54,7 @@ def test_an_agent_with_many_keyframes_delays_only_itself(monkeypatch: pytest.Mon
             inbox.put(add(run, k))
     if ends:
         inbox.put(END)
-    mapper = threading.Thread(target=run_mapper, args=(inbox, lambda answer: None, Config()))
+    mapper = threading.Thread(target=run_mapper, args=(inbox, lambda answer: None))
     mapper.start()
     deadline = time.monotonic() + 20
     while len(order) < 83 and time.monotonic() < deadline:
@@ -68,9 +69,15 @@ def test_a_failed_keyframe_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(mapper_process, "WorkerProcess", NoSolver)
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     answers: list[Any] = []
-    for message in (AddRun("ann-1", hello_of("ann", 1)), add("who-1", 0), add("ann-1", 0), END):
+    for message in (
+        StartMapper(Config()),
+        AddRun("ann-1", hello_of("ann", 1)),
+        add("who-1", 0),
+        add("ann-1", 0),
+        END,
+    ):
         inbox.put(message)
-    run_mapper(inbox, answers.append, Config())
+    run_mapper(inbox, answers.append)
     events = [one.event for found in answers if isinstance(found, MapperResult) for one in found.map_events]
     assert "step failed" in events
     assert len(events) == 2

@@ -19,7 +19,7 @@ from share.net.transport import IncomingMessage
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
 from share.runtime import edge as edge_module
-from share.runtime import served_room
+from share.runtime import mapper_process, served_room
 from share.runtime.edge import EdgeRun
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
@@ -48,7 +48,7 @@ class Link:
     def close(self): ...
 
 
-def dies_of_a_map(inbox, answer, settings, map_file, has_other_rooms):
+def dies_of_a_map(inbox, answer):
     """A mapper that cannot take in any keyframe."""
     while (message := inbox.get()) is not END:
         if isinstance(message, RestoreMap):
@@ -57,7 +57,7 @@ def dies_of_a_map(inbox, answer, settings, map_file, has_other_rooms):
             answer(MapRestored())
 
 
-def dies_later(inbox, answer, settings, map_file, has_other_rooms):
+def dies_later(inbox, answer):
     """A mapper that dies of what comes after its map."""
     while (message := inbox.get()) is not END:
         if isinstance(message, RestoreMap):
@@ -79,7 +79,7 @@ def edge(path, monkeypatch):
     runs = []
 
     def make(mapper):
-        monkeypatch.setattr(served_room, "run_mapper", mapper)
+        monkeypatch.setattr(mapper_process, "run_mapper", mapper)
         died = MapperRestarts.record_death
         monkeypatch.setattr(
             MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
@@ -315,7 +315,7 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     until(lambda: run.report()["session"] != session)
 
 
-def counts(inbox, answer, settings, map_file, has_other_rooms):
+def counts(inbox, answer):
     """A mapper that has looked up seven keyframes and dies."""
     answer(MapperReport({"loops": {"tried": 7, "accepted": 2}, "place_ms": {"n": 7}, "maps": {}}))
     time.sleep(0.1)
@@ -367,7 +367,7 @@ def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
     until(lambda: not any("stuck" in line for line in run.report()["trouble"]))
 
 
-def fails_to_solve(inbox, answer, settings, map_file, has_other_rooms):
+def fails_to_solve(inbox, answer):
     """A mapper whose first solution fails."""
     reason = "map ann-1/0: solve: RuntimeError: no pivot"
     answer(MapperResult([MapEvent(None, "step failed", reason, map_id="ann-1/0")]))

@@ -69,6 +69,32 @@ def test_its_death_is_reported_once() -> None:
     assert lost.empty()
 
 
+def test_another_takes_over_its_answers_and_its_death() -> None:
+    first: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    second: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    companion = WorkerProcess("doubles", doubles, (), first.put, first.put)
+    companion.send(1)
+    assert first.get(timeout=20) == 2
+    companion.attach(second.put, second.put)
+    for message in (2, "die"):
+        companion.send(message)
+    assert second.get(timeout=20) == 4
+    assert "SIGKILL" in second.get(timeout=20)
+    assert companion.is_dead
+    companion.close()
+    assert first.empty()
+
+
+def test_who_takes_over_a_dead_process_hears_of_it() -> None:
+    lost: queue.SimpleQueue[str] = queue.SimpleQueue()
+    companion = WorkerProcess("doubles", doubles, (), lambda message: None, lost.put)
+    companion.send("die")
+    reason = lost.get(timeout=20)
+    companion.attach(lambda message: None, lost.put)
+    assert lost.get_nowait() == reason
+    companion.close()
+
+
 def test_it_ends_with_its_parent() -> None:
     here = os.path.dirname(__file__)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}

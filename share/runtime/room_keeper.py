@@ -1,0 +1,282 @@
+"""One room of a site, which sleeps while nobody is in it: no mapper, no open map file.
+
+awake -> nobody for a while -> a thread closes the room -> asleep
+      -> a message for it, or a keyframe to search -> the thread opens the map file -> awake
+
+A room without a map file, or with one that may not be written, is always awake.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from share.errors import ShareError, WireError
+from share.mapping.places import FindKeyframe
+from share.protocol.edge import EdgeProtocol
+from share.protocol.edge_events import PeerMessageReceived
+from share.protocol.edge_records import SessionTotals
+from share.runtime.output_writer import JobThread
+from share.runtime.served_room import ServedRoom
+from share.store.map_store import MapStore
+from share.timing import Backoff
+from share.wire.codec import decode
+from share.wire.messages import Hello
+from share.wire.room_messages import ClientHello
+
+IDLE_S = 60.0  # without anybody, after which a room falls asleep
+_MAX_WAITING = 64  # messages, and keyframes to search, that wait until the room is awake
+_TIMEOUT_S = 10.0  # for the thread at the end
+
+ServeRoom = Callable[[MapStore | None, SessionTotals, bool], ServedRoom]
+FileStamp = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class _ProcessesEnded:
+    """Of a room that falls asleep."""
+
+
+@dataclass(frozen=True)
+class _FileClosed:
+    incomplete_reason: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class _FileOpened:
+    """is_unchanged: since the room fell asleep."""
+
+    store: MapStore
+    is_unchanged: bool
+
+
+@dataclass(frozen=True)
+class _NotOpened:
+    reason: str
+
+
+_Answer = _ProcessesEnded | _FileClosed | _FileOpened | _NotOpened
+
+
+class RoomKeeper:
+    """Serves one room, and lets it sleep, until `close`.
+
+    serve: starts the room with its opened map file, after earlier sessions with these totals, and whether the
+    file is as the last one has left it; raises StoreError. notify: takes a line for the event
+    log. wake: has `step` called soon; safe from any thread. idle_s: without anybody, until it sleeps.
+    """
+
+    def __init__(
+        self,
+        store: MapStore | None,
+        serve: ServeRoom,
+        notify: Callable[[str], None],
+        wake: Callable[[], None],
+        idle_s: float,
+    ) -> None:
+        self._serve, self._notify, self._wake_loop, self._idle_s = serve, notify, wake, idle_s
+        self._path = store.path if store is not None and store.writable else None
+        self._totals = SessionTotals()
+        self._thread = JobThread("room")
+        self._answers: queue.SimpleQueue[_Answer] = queue.SimpleQueue()
+        self._messages: deque[PeerMessageReceived] = deque(maxlen=_MAX_WAITING)
+        self._searches: deque[FindKeyframe] = deque(maxlen=_MAX_WAITING)
+        self._is_changing = False  # the thread closes or opens the room
+        self._is_called = False  # somebody comes
+        self._failure = ""  # why the map file cannot be opened
+        self._retry_s = 0.0  # monotonic, as below
+        self._backoff = Backoff(time.monotonic_ns())
+        self._peers: dict[bytes, int] = {}  # that a sleeping room knows
+        self._last_report: dict[str, Any] = {}
+        self._last_series: Mapping[str, Mapping[str, Any]] = {}
+        self._used_s = time.monotonic()
+        self._closing: ServedRoom | None = None  # as long as the thread closes it
+        self._closed_stamp: FileStamp | None = None  # of the map file as the room has left it
+        self._room: ServedRoom | None = serve(store, self._totals, False)
+
+    @property
+    def room(self) -> ServedRoom | None:
+        """The room while it is awake."""
+        return self._room
+
+    @property
+    def protocol(self) -> EdgeProtocol | None:
+        """Its state machine while it is awake."""
+        return None if self._room is None else self._room.protocol
+
+    def handle(self, event: PeerMessageReceived) -> None:
+        """Handle a message; a sleeping room keeps it and wakes up, if it comes from somebody that it knows or
+        says hello."""
+        if self._room is not None:
+            self._room.handle(event)
+        elif event.peer_id in self._peers or _is_hello(event):
+            self._messages.append(event)
+            self._is_called = True
+
+    def find(self, request: FindKeyframe) -> None:
+        """Search a keyframe in the map, as soon as the room is awake."""
+        self._used_s = time.monotonic()
+        if self._room is not None:
+            self._room.find(request)
+        else:
+            self._searches.append(request)
+            self._is_called = True
+
+    def knows(self, peer_id: bytes) -> int | None:
+        """As `EdgeProtocol.knows`, also of a sleeping room."""
+        return self._peers.get(peer_id) if self._room is None else self._room.protocol.knows(peer_id)
+
+    def step(self) -> None:
+        """Handle the answers of the room's processes, and the time that has passed."""
+        now_s = time.monotonic()
+        while not self._answers.empty():
+            self._handle_answer(self._answers.get())
+        if self._room is not None:
+            self._room.step()
+            if not self._room.is_idle:
+                self._used_s = now_s
+            elif self._path is not None and now_s - self._used_s >= self._idle_s:
+                self._fall_asleep(self._room)
+        elif self._path is not None and self._is_called and not self._is_changing and now_s >= self._retry_s:
+            self._submit(partial(_open_map, self._path, self._closed_stamp))
+
+    def stop(self) -> None:
+        """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
+        if (room := self._room) is not None:
+            room.stop()
+
+    def close(self) -> str | None:
+        """End all processes and threads. Return why the map file is incomplete, None if it is complete."""
+        if not self._thread.stop(_TIMEOUT_S):
+            return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
+        while not self._answers.empty():
+            if isinstance(answer := self._answers.get(), _FileOpened):
+                answer.store.close()
+        room = self._room or self._closing
+        return None if room is None else room.close()
+
+    # ------------------------------------------------------------------ sleep
+
+    def _fall_asleep(self, room: ServedRoom) -> None:
+        self._peers, self._last_series, self._last_report = (
+            room.protocol.peers(),
+            room.series(),
+            room.report(),
+        )
+        self._totals = room.end_totals()
+        self._room, self._closing = None, room
+        self._submit(partial(_end_processes, room))
+
+    def _submit(self, job: Callable[[], _Answer]) -> None:
+        """Have the thread do a job; `step` handles the answer."""
+        self._is_changing = True
+
+        def run() -> None:
+            self._answers.put(job())
+            self._wake_loop()
+
+        self._thread.submit(run)
+
+    def _handle_answer(self, answer: _Answer) -> None:
+        self._is_changing = False
+        match answer:
+            case _ProcessesEnded() if self._closing is not None:
+                self._closing.handle_answers()
+                self._submit(partial(_close_file, self._closing))
+            case _FileClosed(incomplete_reason) if self._closing is not None:
+                self._closing.finish(incomplete_reason)
+                self._closing, self._closed_stamp = None, _file_stamp(self._path)
+            case _FileOpened(store, is_unchanged):
+                self._wake_up(store, is_unchanged)
+            case _NotOpened(reason):
+                self._retry_later(reason)
+
+    def _wake_up(self, store: MapStore, is_unchanged: bool) -> None:
+        try:
+            self._room = self._serve(store, self._totals, is_unchanged)
+        except ShareError as error:
+            store.close()
+            self._retry_later(str(error))
+            return
+        self._failure, self._is_called, self._used_s = "", False, time.monotonic()
+        for request in self._searches:
+            self._room.find(request)
+        for event in self._messages:
+            self._room.handle(event)
+        self._searches.clear()
+        self._messages.clear()
+
+    def _retry_later(self, reason: str) -> None:
+        """Keep the room asleep for a while. Nobody can enter until its map can be read."""
+        pause_s = self._backoff.record_failure(time.monotonic_ns())
+        self._retry_s = time.monotonic() + pause_s
+        if reason != self._failure:
+            self._notify(f"{reason}; retried every {pause_s:g} s and more")
+        self._failure = reason
+
+    # ------------------------------------------------------------------ what is shown
+
+    def show_poses(self) -> None:
+        if self._room is not None:
+            self._room.show_poses()
+
+    def maps(self) -> Mapping[str, int]:
+        """Return the number of keyframes of each map, as far as it is known."""
+        maps: Mapping[str, int] = self._last_report.get("maps", {})
+        return (self._room.maps() or maps) if self._room is not None else maps
+
+    def series(self) -> Mapping[str, Mapping[str, Any]]:
+        """Return `series` of edge.json; of a sleeping room, as it was."""
+        return self._last_series if self._room is None else {**self._last_series, **self._room.series()}
+
+    def report(self) -> dict[str, Any]:
+        """Return edge.json of the room; of a sleeping one as it was, with `asleep`."""
+        if self._room is not None:
+            return self._room.report()
+        trouble = [self._failure] if self._failure else []
+        return {**self._last_report, "trouble": trouble, "asleep": True}
+
+
+def _end_processes(room: ServedRoom) -> _ProcessesEnded:
+    room.end_processes()
+    return _ProcessesEnded()
+
+
+def _close_file(room: ServedRoom) -> _FileClosed:
+    return _FileClosed(room.close_file())
+
+
+def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotOpened:
+    is_unchanged = closed_stamp is not None and _file_stamp(path) == closed_stamp
+    try:
+        store = MapStore.open(path)
+        with contextlib.suppress(Exception):  # said when the room starts, or the file is set aside then
+            store.outline()  # which takes a while, and is kept
+        return _FileOpened(store, is_unchanged)
+    except ShareError as error:
+        return _NotOpened(str(error))
+
+
+def _file_stamp(path: Path | None) -> FileStamp | None:
+    """Return inode, size and time of the last change; None if there is no such file."""
+    if path is None:
+        return None
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _is_hello(event: PeerMessageReceived) -> bool:
+    try:
+        return isinstance(decode(event.frames), Hello | ClientHello)
+    except WireError:
+        return False

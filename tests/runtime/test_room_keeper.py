@@ -1,0 +1,296 @@
+"""A room of a site that sleeps while nobody is in it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.hellos import hello_of
+
+from share.config import Config
+from share.errors import StoreError
+from share.mapping.loops import KeyframeKey
+from share.mapping.places import FindKeyframe
+from share.protocol.edge import EdgeProtocol
+from share.protocol.edge_events import EdgeEvent, PeerMessageReceived
+from share.protocol.edge_records import SessionTotals
+from share.runtime.room_keeper import RoomKeeper
+from share.store.map_store import MapStore
+from share.wire.codec import encode
+from share.wire.messages import Ping, peer_id
+
+ANN, BOB = hello_of("ann", 1), hello_of("bob", 2)
+
+
+@dataclass
+class FakeRoom:
+    """Stands for a `ServedRoom` and its processes."""
+
+    store: MapStore | None
+    is_unchanged: bool
+    is_idle: bool = True
+    is_ended: bool = False
+    handled: list[EdgeEvent] = field(default_factory=list)
+    sought: list[FindKeyframe] = field(default_factory=list)
+    threads: dict[str, int] = field(default_factory=dict)  # in which each part of the end ran
+
+    def __post_init__(self) -> None:
+        self.protocol = EdgeProtocol(Config(), 1)
+
+    def handle(self, event: EdgeEvent) -> None:
+        self.handled.append(event)
+        self.protocol.handle(event, time.monotonic_ns())
+
+    def find(self, request: FindKeyframe) -> None:
+        self.sought.append(request)
+
+    def step(self) -> None:
+        assert not self.is_ended
+
+    def stop(self) -> None:
+        pass
+
+    def report(self) -> dict[str, Any]:
+        return {"maps": {"ann/0": 7}, "trouble": ["the solver: died"]}
+
+    def maps(self) -> dict[str, int]:
+        return {}
+
+    def series(self) -> dict[str, Any]:
+        return {}
+
+    def end_totals(self) -> SessionTotals:
+        return SessionTotals()
+
+    def _note(self, part: str) -> None:
+        self.threads[part] = threading.get_ident()
+
+    def end_processes(self) -> None:
+        self._note("end_processes")
+        self.is_ended = True
+
+    def handle_answers(self) -> None:
+        self._note("handle_answers")
+
+    def close_file(self) -> str | None:
+        self._note("close_file")
+        if self.store is not None:
+            self.store.close()
+        return None
+
+    def finish(self, incomplete_reason: str | None) -> None:
+        self._note("finish")
+
+    def close(self) -> str | None:
+        self.end_processes()
+        return self.close_file()
+
+
+class Bench:
+    """A keeper of fake rooms, over a real map file."""
+
+    def __init__(self, store: MapStore | None, idle_s: float = 0.0) -> None:
+        self.rooms: list[FakeRoom] = []
+        self.lines: list[str] = []
+        self.is_failing = False
+        self.woken = threading.Event()
+        self.keeper = RoomKeeper(store, self._serve, self.lines.append, self.woken.set, idle_s)
+
+    def _serve(self, store: MapStore | None, totals: SessionTotals, is_unchanged: bool) -> Any:
+        if self.is_failing:
+            raise StoreError("it cannot be read")
+        self.rooms.append(FakeRoom(store, is_unchanged))
+        return self.rooms[-1]
+
+    def step_until(self, is_awake: bool) -> None:
+        deadline = time.monotonic() + 20.0
+        while self.is_awake is not is_awake:
+            assert time.monotonic() < deadline
+            self.woken.wait(0.01)
+            self.woken.clear()
+            self.keeper.step()
+
+    @property
+    def is_awake(self) -> bool | None:
+        """None: in between."""
+        if self.keeper.room is not None:
+            return True
+        return None if self.keeper._is_changing else False
+
+
+@pytest.fixture
+def bench(tmp_path: Path):
+    bench = Bench(MapStore.open(tmp_path / "room.sqlite"))
+    yield bench
+    bench.keeper.close()
+
+
+def hello(of=ANN) -> PeerMessageReceived:
+    return PeerMessageReceived(peer_id(of.run_id), [bytes(f) for f in encode(of)])
+
+
+def ping(of=ANN) -> PeerMessageReceived:
+    return PeerMessageReceived(peer_id(of.run_id), [bytes(f) for f in encode(Ping(1, 1))])
+
+
+def request() -> FindKeyframe:
+    return FindKeyframe(KeyframeKey("ann", 1), None, ANN.rig)  # type: ignore[arg-type]
+
+
+def is_locked(path: Path) -> bool:
+    try:
+        MapStore.open(path).close()
+    except StoreError:
+        return True
+    return False
+
+
+def test_an_empty_room_closes_its_map_file_and_opens_it_for_a_hello(bench, tmp_path):
+    path = tmp_path / "room.sqlite"
+    assert is_locked(path)
+    bench.step_until(is_awake=False)
+    assert not is_locked(path)
+    assert bench.rooms[0].is_ended
+
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    assert is_locked(path)
+    first, second = bench.rooms
+    assert [event.peer_id for event in second.handled] == [peer_id(ANN.run_id)]
+    assert second.is_unchanged
+    assert not first.is_unchanged
+
+
+def test_what_waits_for_processes_or_the_disk_runs_in_a_thread_and_the_rest_in_the_loop(bench):
+    bench.step_until(is_awake=False)
+    threads, loop = bench.rooms[0].threads, threading.get_ident()
+    assert threads["end_processes"] != loop
+    assert threads["close_file"] != loop
+    assert threads["handle_answers"] == threads["finish"] == loop
+
+
+def test_a_room_stays_awake_while_somebody_is_in_it_and_a_while_longer(tmp_path):
+    bench = Bench(MapStore.open(tmp_path / "room.sqlite"), idle_s=3600.0)
+    bench.rooms[0].is_idle = False
+    for _ in range(3):
+        bench.keeper.step()
+    bench.rooms[0].is_idle = True
+    bench.keeper.step()
+    assert bench.keeper.room is bench.rooms[0]
+    bench.keeper.close()
+
+
+def test_a_room_without_a_writable_map_file_never_sleeps(tmp_path):
+    path = tmp_path / "room.sqlite"
+    MapStore.open(path).close()
+    for store in (None, MapStore.read(path)):
+        bench = Bench(store)
+        bench.keeper.step()
+        assert bench.keeper.room is bench.rooms[0]
+        bench.keeper.close()
+
+
+def test_a_keyframe_to_search_wakes_it(bench):
+    bench.step_until(is_awake=False)
+    one = request()
+    bench.keeper.find(one)
+    bench.step_until(is_awake=True)
+    assert bench.rooms[1].sought == [one]
+
+
+def test_only_a_hello_or_somebody_it_knows_wakes_it(bench):
+    bench.keeper.handle(hello(ANN))
+    assert bench.keeper.knows(peer_id(ANN.run_id)) == 0
+    bench.step_until(is_awake=False)
+    assert bench.keeper.knows(peer_id(ANN.run_id)) == 0
+    assert bench.keeper.knows(peer_id(BOB.run_id)) is None
+
+    noise = PeerMessageReceived(peer_id(BOB.run_id), [b"\xff" * 40])
+    for event in (ping(BOB), noise):
+        bench.keeper.handle(event)
+    for _ in range(5):
+        bench.keeper.step()
+    assert bench.is_awake is False
+
+    bench.keeper.handle(ping(ANN))
+    bench.step_until(is_awake=True)
+    assert len(bench.rooms[1].handled) == 1
+
+
+def test_a_message_that_comes_while_it_falls_asleep_is_not_lost(bench):
+    bench.keeper.step()
+    assert bench.is_awake is None
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    assert [event.peer_id for event in bench.rooms[1].handled] == [peer_id(ANN.run_id)]
+
+
+def test_messages_that_wait_are_bounded(bench):
+    bench.step_until(is_awake=False)
+    for _ in range(10_000):
+        bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    assert len(bench.rooms[1].handled) == 64
+
+
+def test_a_file_that_another_program_has_written_is_new(bench, tmp_path):
+    bench.step_until(is_awake=False)
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write([])
+        store.compact()
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    assert not bench.rooms[1].is_unchanged
+
+
+def test_a_file_that_another_edge_uses_is_said_once_and_opened_later(bench, tmp_path):
+    bench.step_until(is_awake=False)
+    other = MapStore.open(tmp_path / "room.sqlite")
+    bench.keeper.handle(hello())
+    deadline = time.monotonic() + 20.0
+    while not bench.lines:
+        assert time.monotonic() < deadline
+        bench.keeper.step()
+    assert bench.keeper.report()["trouble"] == [bench.lines[0].rpartition("; retried")[0]]
+    other.close()
+    bench.step_until(is_awake=True)
+    assert len(bench.lines) == 1
+    assert bench.keeper.report()["trouble"] == ["the solver: died"]
+
+
+def test_a_map_that_cannot_be_read_keeps_the_room_asleep(bench, tmp_path):
+    bench.step_until(is_awake=False)
+    bench.is_failing = True
+    bench.keeper.handle(hello())
+    deadline = time.monotonic() + 20.0
+    while not bench.lines:
+        assert time.monotonic() < deadline
+        bench.keeper.step()
+    assert not is_locked(tmp_path / "room.sqlite")
+    bench.is_failing = False
+    bench.step_until(is_awake=True)
+
+
+def test_a_sleeping_room_is_shown_as_it_was(bench):
+    bench.step_until(is_awake=False)
+    report = bench.keeper.report()
+    assert report["asleep"] is True
+    assert report["maps"] == bench.keeper.maps() == {"ann/0": 7}
+    assert report["trouble"] == []
+
+
+def test_it_ends_well_in_every_state(tmp_path):
+    for steps in range(4):
+        bench = Bench(MapStore.open(tmp_path / f"{steps}.sqlite"))
+        for _ in range(steps):
+            bench.keeper.step()
+            time.sleep(0.02)
+        if steps == 3:
+            bench.keeper.handle(hello())
+            bench.keeper.step()
+        assert bench.keeper.close() is None
+        assert not is_locked(tmp_path / f"{steps}.sqlite")

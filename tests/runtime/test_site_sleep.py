@@ -1,0 +1,88 @@
+"""Rooms of a site with real mappers and map files: they sleep, and wake up as they were."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.hellos import hello_of
+from helpers.map_changes import pose, small_map
+
+from share.config import Config
+from share.errors import StoreError
+from share.protocol.edge_events import PeerMessageReceived
+from share.runtime.edge_observer import EdgeObservers
+from share.runtime.site_rooms import RoomSetup, SiteRooms
+from share.store.map_store import MapStore
+from share.wire.codec import decode, encode
+from share.wire.messages import Welcome, peer_id
+
+
+class Host:
+    """The edge around the rooms, without a link."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.events: list[tuple[str, str]] = []
+
+    def wake(self) -> None: ...
+
+    def send(self, peer: bytes, frames: Any) -> None:
+        self.sent.append(decode([bytes(f) for f in frames]))
+
+    def expect_growth(self, is_expected: bool) -> None: ...
+
+    def record(self, fields: dict[str, Any]) -> None:
+        self.events.append((fields["event"], fields["reason"]))
+
+    def log_event(self, event: str, reason: str) -> None:
+        self.events.append((event, reason))
+
+
+def setup_of(folder: Path, name: str, changes: list[Any]) -> RoomSetup:
+    store = MapStore.open(folder / f"{name}.sqlite")
+    store.write(changes)
+    return RoomSetup(name, Config(), store, EdgeObservers())
+
+
+def is_locked(path: Path) -> bool:
+    try:
+        MapStore.open(path).close()
+    except StoreError:
+        return True
+    return False
+
+
+@pytest.mark.long
+def test_rooms_sleep_and_a_run_that_returns_goes_on_in_its_room(tmp_path: Path) -> None:
+    host = Host()
+    setups = [setup_of(tmp_path, "hall", []), setup_of(tmp_path, "lab", small_map())]
+    site = SiteRooms(host, setups, time.monotonic_ns(), False, idle_s=0.0)
+
+    def step_until(condition: Any) -> dict[str, Any]:
+        deadline = time.monotonic() + 60.0
+        while not condition(report := site.report()):
+            assert time.monotonic() < deadline, report["rooms"]
+            time.sleep(0.01)
+            site.step()
+        return report
+
+    asleep = step_until(lambda now: all("asleep" in room for room in now["rooms"].values()))
+    assert asleep["rooms"]["lab"]["keyframes"] == 40
+    assert asleep["directory"]["keyframes"] == 40
+    step_until(lambda now: not any(map(is_locked, tmp_path.glob("*.sqlite"))))
+
+    ann = hello_of("ann", 1, T=pose(3))
+    site.handle(PeerMessageReceived(peer_id(1), [bytes(f) for f in encode(ann)]))
+    awake = step_until(lambda now: host.sent)
+    assert [type(one) for one in host.sent[:1]] == [Welcome]
+    assert host.sent[0].next_keyframe == 20
+    assert "asleep" not in awake["rooms"]["lab"]
+    assert awake["rooms"]["hall"]["asleep"]
+    again = step_until(lambda now: now["rooms"]["lab"]["keyframes"] == 40 and not now.get("loading"))
+    assert again["directory"]["keyframes"] == 40
+    assert again["agents"]["ann"]["room"] == "lab"
+    assert site.close() is None
+    assert not [one for one in host.events if one[0] in ("mapper died", "internal error")]
