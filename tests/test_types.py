@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, checked_pose
+from share.checks import MAX_ID, MAX_ODOM_M, MAX_POSITION_M, checked_cov, checked_pose
 from share.earlier_poses import MAX_EARLIER, EarlierPoses
 from share.geometry import se3
 from share.types import Keyframe, View
@@ -113,3 +113,15 @@ def test_a_keyframe_is_relative_to_keyframes_before_it(ids: list[int]) -> None:
     with pytest.raises(ValueError, match=r"earlier: ids must lie in 0 \.\. 8"):
         keyframe(9, earlier(ids))
     assert keyframe(9, earlier([0, 8])).earlier.ids.tolist() == [0, 8]
+
+
+@pytest.mark.parametrize(
+    ("size", "sign", "reason"), [(1.7e308, -1, "exceeds 1e12"), (2e12, 1, "exceeds 1e12"), (1, -1, "symmetric")]
+)
+def test_a_covariance_of_any_size_is_refused_in_words_alone(size, sign, reason, recwarn):
+    """numpy's warnings would go to the log of an edge."""
+    cov = np.eye(6)
+    cov[0, 1], cov[1, 0] = size, sign * size
+    with pytest.raises(ValueError, match=reason):
+        checked_cov("cov", cov)
+    assert not recwarn.list

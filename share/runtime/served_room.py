@@ -14,12 +14,11 @@ import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from share.config import Config
 from share.errors import StoreError
-from share.event_kinds import EventKind
-from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
+from share.mapping.places import FindKeyframe, KeyframeSought
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
 from share.protocol.edge import EdgeProtocol
@@ -60,50 +59,16 @@ from share.runtime.mapper_process import (
     start_mapper_process,
 )
 from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
+from share.runtime.room_host import OtherRooms, RoomHost
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
 from share.runtime.worker_process import WorkerProcess
 from share.scheduling.policies import POLICIES
 from share.store.map_store import MapStore
-from share.wire.layouts import Bytes
 
 _DRAIN_S = 0.5  # wait for the map writer of a session that is over
 
 
 StartProcess = Callable[[Callable[[Any], None], Callable[[str], None], float], WorkerProcess]
-
-
-class RoomHost(Protocol):
-    """What a room needs of the edge around it. All but `wake` are called from the edge's loop."""
-
-    def wake(self) -> None:
-        """Have `ServedRoom.step` called soon. Safe from any thread."""
-
-    def send(self, peer_id: bytes, frames: Sequence[Bytes]) -> None: ...
-
-    def expect_growth(self, is_expected: bool) -> None:
-        """The memory of this process grows while a stored map is restored."""
-
-    def record(self, fields: dict[str, Any]) -> None:
-        """Log an event of the state machine."""
-
-    def log_event(self, event: EventKind, reason: str) -> None:
-        """Log what happens to the room's processes and files."""
-
-
-class OtherRooms(Protocol):
-    """What a room tells of itself where there are others. All is called from the edge's loop."""
-
-    def note_session(self) -> None:
-        """The room's map begins anew, with what its file holds."""
-
-    def note_keyframe(self, added: AddKeyframe) -> None:
-        """A keyframe goes to the mapper."""
-
-    def note_places(self, news: Sequence[PlaceNews]) -> None:
-        """The map has changed, or has not recognised a keyframe."""
-
-    def note_sought(self, sought: KeyframeSought) -> None:
-        """The answer to `ServedRoom.find`."""
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.fault_guard import FaultGuard
 from share.runtime.output_writer import JobThread
+from share.runtime.room_host import RoomHost
 from share.runtime.room_keeper import IDLE_S, RoomKeeper
-from share.runtime.served_room import RoomHost, ServedRoom
+from share.runtime.served_room import ServedRoom
 from share.runtime.spare_mapper import SpareMapper
 from share.site.building import RoomMap
 from share.site.directory import PlaceDirectory, RoomRanking
