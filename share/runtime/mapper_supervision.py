@@ -91,9 +91,9 @@ class MapperRestarts:
         try:
             restore, outline = RestoreMap(self.store.rows(), self._has_keys), self.store.outline()
             outline = with_unknown_credentials(outline) if self._has_keys else outline
+            self.forgotten = outline.forgotten if self.forgotten is None else self.forgotten
             known = restored_runs(outline, self._known_m)
             self.objects = outline.objects if self.objects is None else self.objects
-            self.forgotten = outline.forgotten if self.forgotten is None else self.forgotten
         except ShareError:
             raise
         except Exception as error:  # no content of a file may end the edge

@@ -211,7 +211,7 @@ class MapStore:
         """Rename the map and start an empty one in its place, which knows the removed runs too. Return the
         new name of the old one.
 
-        Raises ShareError if that fails: then the map is unchanged.
+        Raises ShareError if that fails: then the map is unchanged, or the new one knows none.
         """
         about = read_intact_rows(self._writable_db(), ["about"]).tables["about"]
         self._writable_db().close()
