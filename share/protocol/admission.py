@@ -221,7 +221,6 @@ class RunRegistry(Mapping[bytes, Peer]):
         absent = self.by_key.get(peer.key)
         if absent is not None:
             self._remove(absent)
-        self._forgotten.pop(peer_tag(peer.id), None)
         self.add(peer)
         return absent is not None
 
