@@ -21,10 +21,13 @@ from share.vision.packed_view import PackedView
 from share.wire.messages import Hello
 from share.wire.room_messages import RoomObject
 
+MAX_FORGOTTEN_RUNS = 65_536  # removed runs that are still recognised; beyond, the oldest are not
+
 
 @dataclass(frozen=True, eq=False)
 class SaveRun:
-    """A run of an agent; comes before its keyframes. run_key: names it in all changes.
+    """A run of an agent; comes before its keyframes. run_key: names it in all changes. One that was removed
+    goes on with the ids after those that it had.
 
     credential: the public key that authenticated it; "": no key; None: unknown.
     """
@@ -122,7 +125,8 @@ class RemoveKeyframes:
 
 @dataclass(frozen=True)
 class RemoveRun:
-    """Removes a run without keyframes, with its name. No change of it follows."""
+    """Removes a run without keyframes, with its name. Its `public_tag` stays, and the id after all that it
+    ever had: they are never requested again. No change of it follows before its next SaveRun."""
 
     run_key: str
 
@@ -201,7 +205,8 @@ class StoredMap:
 
     runs, segments (names), keyframes: in order of arrival; segments may be empty. links: for keyframes whose
     odometry edge was replaced. loops: oldest first. next_ids: for each run, an id above all it ever had here.
-    problems: what is missing, a line each. objects: of the room.
+    problems: what is missing, a line each. objects: of the room. forgotten: for each removed run, by its
+    `public_tag`, an id above all it ever had, oldest first.
     """
 
     runs: tuple[SaveRun, ...] = ()
@@ -213,6 +218,7 @@ class StoredMap:
     next_ids: Mapping[str, int] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     objects: tuple[SaveObject, ...] = ()
+    forgotten: Mapping[str, int] = field(default_factory=dict)
 
 
 def with_unknown_credentials(stored: StoredMap) -> StoredMap:

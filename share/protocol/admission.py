@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from math import ceil
 
 from share.config import EdgeConfig
 from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import MAX_FORGOTTEN_RUNS
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.peer import Peer, RestoredRun, Sender
 from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
-from share.wire.messages import Hello, PoseUpdate, public_tag
+from share.wire.messages import Hello, PoseUpdate, peer_tag, public_tag
 
 # Limits on new runs, each at once and a second: each run stays in the report, and in the map once it has a
 # keyframe. One name: as many as a person starts while trying things out; one key: a full room; the edge: two.
@@ -62,8 +64,6 @@ class Admission:
         self, event: PeerMessageReceived, hello: Hello, runs: RunRegistry, now_ns: int
     ) -> str | None:
         """Return why this run may not join, for a person; None if it may. event: carried `hello`."""
-        if runs.was_forgotten(event.peer_id):
-            return f"this run of '{hello.name}' was forgotten during its absence: start the agent again"
         if not event.is_authorised_for(hello.name):
             return name_objection(hello.name, event.allowed_names or ())
         if hello.streams_frames and not self._tracks_agents:
@@ -119,21 +119,34 @@ def name_objection(name: str, allowed_names: Collection[str]) -> str:
 
 # Registry of the runs that an edge knows, ended ones included.
 _MAX_IDLE = 256  # runs that left without a keyframe; beyond, the oldest is forgotten
-_MAX_FORGOTTEN = 65_536  # forgotten runs that are still recognised; older ones have been silent for hours
+
+
+@dataclass(frozen=True)
+class ForgottenRun:
+    """What is kept of a forgotten run, in case its agent comes back. next_keyframe: above all ids that it
+    had. session: as in `Peer`; None: of an earlier start of the edge. revision: of its newest correction in
+    that session."""
+
+    next_keyframe: int
+    session: int | None = None
+    revision: int = 0
 
 
 class RunRegistry(Mapping[bytes, Peer]):
     """Runs by their peer id on the link. Each run has a key that names it everywhere else; the run of a name
-    that joined or came back last is the latest. unjoined: what is counted of all other peers together."""
+    that joined or came back last is the latest. unjoined: what is counted of all other peers together.
+    forgotten: next keyframes of runs that earlier sessions have forgotten, by `public_tag`."""
 
-    def __init__(self) -> None:
+    def __init__(self, forgotten: Mapping[str, int]) -> None:
         self.unjoined = Sender()
         self.by_key: dict[str, Peer] = {}
         self._present: dict[str, Peer] = {}
         self._peers: dict[bytes, Peer] = {}
         self._runs_by_name: dict[str, dict[str, Peer]] = {}  # by key, the latest last
         self._empty_runs: dict[str, int] = {}  # runs without anything in the map: their newest keyframe
-        self._forgotten_ids: dict[bytes, None] = {}
+        self._forgotten: dict[str, ForgottenRun] = {}  # by public tag, the latest last
+        for tag, next_keyframe in forgotten.items():
+            self._remember(tag, ForgottenRun(next_keyframe))
         self.forgotten_count = 0  # since the edge started
 
     def __getitem__(self, peer_id: bytes) -> Peer:
@@ -208,7 +221,6 @@ class RunRegistry(Mapping[bytes, Peer]):
         absent = self.by_key.get(peer.key)
         if absent is not None:
             self._remove(absent)
-        self._forgotten_ids.pop(peer.id, None)
         self.add(peer)
         return absent is not None
 
@@ -232,11 +244,9 @@ class RunRegistry(Mapping[bytes, Peer]):
         was_latest = self.is_latest(peer)
         self._remove(peer)
         self._empty_runs.pop(peer.key, None)
-        if peer.odometry_base is not None:
-            self.forgotten_count += 1
-            self._forgotten_ids[peer.id] = None
-            if len(self._forgotten_ids) > _MAX_FORGOTTEN:
-                del self._forgotten_ids[next(iter(self._forgotten_ids))]
+        self.forgotten_count += peer.odometry_base is not None
+        if (next_keyframe := peer.reorder_buffer.next_keyframe) > 0:
+            self._remember(peer_tag(peer.id), ForgottenRun(next_keyframe, peer.session, peer.revision))
         return was_latest
 
     def _remove(self, peer: Peer) -> None:
@@ -245,10 +255,19 @@ class RunRegistry(Mapping[bytes, Peer]):
         if not self._runs_by_name[peer.name]:
             del self._runs_by_name[peer.name]
 
-    def was_forgotten(self, peer_id: bytes) -> bool:
-        """Return whether this session has forgotten the run, and with it the keyframes that it
-        acknowledged."""
-        return peer_id in self._forgotten_ids
+    def _remember(self, tag: str, run: ForgottenRun) -> None:
+        self._forgotten.pop(tag, None)
+        self._forgotten[tag] = run
+        if len(self._forgotten) > MAX_FORGOTTEN_RUNS:
+            del self._forgotten[next(iter(self._forgotten))]
+
+    def forgotten(self, peer_id: bytes) -> ForgottenRun | None:
+        """Return what is kept of a peer's run that was forgotten and has not come back; None of others."""
+        return None if peer_id in self._peers else self._forgotten.get(peer_tag(peer_id))
+
+    def forgotten_next_keyframes(self) -> dict[str, int]:
+        """Return the next keyframes of forgotten runs, for a session that follows."""
+        return {tag: run.next_keyframe for tag, run in self._forgotten.items()}
 
     def oldest_idle(self) -> Peer | None:
         """Return the oldest of too many runs without a keyframe, None if they are not too many."""

@@ -7,7 +7,7 @@ answers with map events; the map writer stores what must survive a crash and ans
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from share import __version__
@@ -33,7 +33,7 @@ from share.wire import messages as wire
 from share.wire.codec import decode, message_bytes
 from share.wire.room_messages import ClientHello
 
-_NO_SESSION = 0  # in a pong to a client that the edge has forgotten: it says hello again
+_NO_SESSION = 0  # in a pong to a client or a run that the edge has forgotten: it says hello again
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 
@@ -43,6 +43,7 @@ class EdgeProtocol:
     session: names this start of the edge, so that agents notice a restart. has_store: acknowledge a keyframe
     only after `ChangesSaved`. restored: runs of earlier sessions; objects: of the room. began_ns: origin of
     the times in records (default: the first event). trackers: those that the edge runs for its agents.
+    forgotten: as in `StoredMap`.
     """
 
     def __init__(
@@ -54,11 +55,13 @@ class EdgeProtocol:
         began_ns: int | None = None,
         objects: Sequence[SaveObject] = (),
         trackers: RunTrackers | None = None,
+        forgotten: Mapping[str, int] | None = None,
     ) -> None:
-        self._config, self._session, self._registry = config, session, RunRegistry()
+        self._config, self._session, self._registry = config, session, RunRegistry(forgotten or {})
         for run in restored:
             self._registry.restore(run, session)
         self.latest_poses = self._registry.latest_poses
+        self.forgotten_next_keyframes = self._registry.forgotten_next_keyframes
         self._out = EdgeOutput(self._registry, has_store, began_ns)
         self._rate_scheduler = RateScheduler(config.control, config.edge.policy)
         self.room = ClientService(self._out, self._registry, session, config.edge.silent_s, objects)
@@ -148,7 +151,7 @@ class EdgeProtocol:
             case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 times = message.sent_ns, self._out.now_ns, self._out.now_ns
                 session = self._session if peer is None else peer.session
-                if self.room.clients.was_removed(event.peer_id):
+                if self._has_forgotten(event.peer_id):
                     session = _NO_SESSION
                 self._out.send(event.peer_id, wire.Pong(message.sequence, *times, session))
             case _ if client is not None:
@@ -161,6 +164,9 @@ class EdgeProtocol:
             case _:
                 reason = f"a {type(message).__name__} before its hello"
                 self._registry.unjoined.count("unexpected", reason, self._out.now_ns)
+
+    def _has_forgotten(self, peer_id: bytes) -> bool:
+        return self.room.clients.was_removed(peer_id) or self._registry.forgotten(peer_id) is not None
 
     def _on_agent_message(self, peer: Peer, message: wire.Message) -> None:
         """Handle a message of a joined agent."""
@@ -235,7 +241,8 @@ class EdgeProtocol:
     def _apply(self, peer: Peer, keyframe: Keyframe) -> None:
         try:
             is_entering = peer.entry is not None and peer.entry.is_entering
-            keyframe, problem = sanitise(keyframe, peer.odometry_base, peer.hello.rig.cam0, is_entering)
+            base, camera = peer.odometry_base, peer.hello.rig.cam0
+            keyframe, problem = sanitise(keyframe, base, camera, peer.forgotten_below, is_entering)
         except ValueError as error:
             self._out.count_bad_message(peer, str(error))
             return
@@ -285,10 +292,12 @@ class EdgeProtocol:
     # ------------------------------------------------------------------ runs that change the room
 
     def knows(self, peer_id: bytes) -> int | None:
-        """Return the number of keyframes that a run of this peer has sent, 0 for a client; None if neither is
-        known."""
+        """Return the number of keyframes that a run of this peer has sent, also one that was forgotten, 0 for
+        a client; None if neither is known."""
         if (peer := self._registry.get(peer_id)) is not None:
             return peer.reorder_buffer.next_keyframe
+        if (forgotten := self._registry.forgotten(peer_id)) is not None:
+            return forgotten.next_keyframe
         return None if self.room.clients.get(peer_id) is None else 0
 
     def is_present(self, name: str) -> bool:

@@ -10,9 +10,10 @@ from share.geometry.camera import Rig
 from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import RemoveRun, SaveCredential
 from share.protocol import edge_events as ed
-from share.protocol.admission import Admission, RunRegistry, name_objection, new_run_key
+from share.protocol.admission import Admission, ForgottenRun, RunRegistry, name_objection, new_run_key
 from share.protocol.client_service import ClientService
 from share.protocol.edge_records import EdgeOutput
+from share.protocol.keyframe_intake import ReorderBuffer
 from share.protocol.peer import Peer, RoomEntry
 from share.scheduling.rate_scheduler import RateScheduler
 from share.scheduling.room_budget import RateGrant
@@ -100,15 +101,34 @@ class RoomMembership:
             self._forget(idle)
         self._admission.record_join(event, hello, self._out.now_ns)
         self._supersede(hello.name)
-        key = new_run_key(hello, self._registry.by_key)
-        peer = Peer(event.peer_id, hello, key, self._out.now_ns, self._session, credential=event.credential)
+        peer = self._new_peer(event, hello)
         self._registry.add(peer)
         self._out.add(ed.AddRun(peer.key, peer.hello, event.credential))
         self._rate_scheduler.begin_run(peer.name)
-        self._out.record("agent joined", peer, f"{hello.kind} '{hello.name}'")
+        goes_on = f"; goes on with keyframe {peer.forgotten_below}: those before are forgotten"
+        who = f"{hello.kind} '{hello.name}'{goes_on if peer.forgotten_below else ''}"
+        self._out.record("agent joined", peer, who)
         self._make_room(peer)
         self._trackers.add(peer.key, hello.rig)
         return peer
+
+    def _new_peer(self, event: ed.PeerMessageReceived, hello: wire.Hello) -> Peer:
+        """Return the run. One that was forgotten goes on after the keyframes that it had: they are not asked
+        for again, and count as known if they come."""
+        forgotten = self._registry.forgotten(event.peer_id) or ForgottenRun(0)
+        session = self._session if forgotten.session is None else forgotten.session
+        return Peer(
+            id=event.peer_id,
+            hello=hello,
+            key=new_run_key(hello, self._registry.by_key),
+            last_received_ns=self._out.now_ns,
+            session=session,
+            reorder_buffer=ReorderBuffer(forgotten.next_keyframe),
+            durable_below=forgotten.next_keyframe,
+            forgotten_below=forgotten.next_keyframe,
+            revision=forgotten.revision,
+            credential=event.credential,
+        )
 
     def refuse(self, peer_id: bytes, reason: str, version: int = WIRE_VERSION) -> None:
         self._out.send(peer_id, wire.Refused(reason), version)

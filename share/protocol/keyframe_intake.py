@@ -201,17 +201,24 @@ class OdometryBase:
 
 
 def sanitise(
-    keyframe: Keyframe, base: OdometryBase | None, camera: Camera, is_entering: bool = False
+    keyframe: Keyframe,
+    base: OdometryBase | None,
+    camera: Camera,
+    forgotten_below: int = 0,
+    is_entering: bool = False,
 ) -> tuple[Keyframe, str | None]:
     """Return the next keyframe of a run as the map accepts it, and what was wrong with it, None if nothing.
 
     base: the run's keyframe before; camera: its cam0. is_entering: the keyframe before is in another room. A
     keyframe with an implausible jump, or with a motion that contradicts its two poses, starts a segment in
-    the same odom, as does one that enters. Poses relative to earlier keyframes
-    that contradict its steps are dropped, as is an image that cannot be this camera's. An excessive
-    covariance is bounded. Raises ValueError if its reference is not `base`.
+    the same odom, as does one that enters, or whose reference is forgotten: after `base`, below
+    `forgotten_below`. Poses relative to earlier keyframes that contradict its steps are dropped, as is an
+    image that cannot be this camera's. An excessive covariance is bounded. Raises ValueError if its reference
+    is neither `base` nor forgotten.
     """
     problems = []
+    if (0 if base is None else base.id + 1) <= keyframe.reference < forgotten_below:
+        keyframe = _starting_segment(keyframe)
     if objection := image_objection(keyframe.image, camera):
         problems.append(f"keyframe {keyframe.id}: {objection}: without it")
         keyframe = replace(keyframe, image=keyframe.image.without_jpeg())
@@ -222,8 +229,7 @@ def sanitise(
         if reason is not None:
             problems.append(f"{reason}: new segment")
         if reason is not None or is_entering:
-            earlier = EarlierPoses.empty()
-            keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=earlier)
+            keyframe = _starting_segment(keyframe)
         else:
             earlier, problem = base.steps_to(keyframe).agreeing(keyframe.earlier)
             problems += [] if problem is None else [f"keyframe {keyframe.id}: {problem}"]
@@ -232,6 +238,10 @@ def sanitise(
         problems.append(f"keyframe {keyframe.id} has a variance of {variance:.0e}; treated as unknown")
         keyframe = replace(keyframe, cov=keyframe.cov * (_MAX_VARIANCE / variance))
     return keyframe, "; ".join(problems) or None
+
+
+def _starting_segment(keyframe: Keyframe) -> Keyframe:
+    return replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=EarlierPoses.empty())
 
 
 def _segment_reason(keyframe: Keyframe, base: OdometryBase) -> str | None:

@@ -153,7 +153,8 @@ class RoomEntry:
 class Peer(Sender):
     """A run of an agent. id: of the transport. session: the number that its agent knows this edge by.
     durable_below: keyframes below this id are stored, and so acknowledged. pending_saves: number of keyframes
-    applied but not stored yet. odometry_base: the newest applied keyframe. credential: as in `SaveRun`."""
+    applied but not stored yet. odometry_base: the newest applied keyframe. forgotten_below: no keyframe after
+    that and below this id is known here any more. credential: as in `SaveRun`."""
 
     id: bytes
     hello: Hello
@@ -163,6 +164,7 @@ class Peer(Sender):
     reorder_buffer: ReorderBuffer = field(default_factory=ReorderBuffer)
     durable_below: int = 0
     odometry_base: OdometryBase | None = None
+    forgotten_below: int = 0
     status: PeerStatus = field(default_factory=PeerStatus)
     suspect_keyframes: Faults = field(default_factory=Faults)  # accepted only after a change
     overload: Faults = field(default_factory=Faults)  # keyframes that were deferred; the agent resends them
@@ -194,8 +196,8 @@ class Peer(Sender):
 
     @property
     def is_idle(self) -> bool:
-        """Whether it left without ever sending a keyframe."""
-        return self.is_gone and self.reorder_buffer.next_keyframe == 0
+        """Whether it left without a keyframe since it joined."""
+        return self.is_gone and self.odometry_base is None and not self.pending_saves
 
     @property
     def overload_reason(self) -> str | None:
@@ -264,23 +266,32 @@ class RestoredRun:
     """A run stored by an earlier session of the edge.
 
     odometry_base: its last keyframe; None without one. last_correction_event: sent with the
-    welcome. credential: as in `SaveRun`."""
+    welcome. credential: as in `SaveRun`. next_id: above the ids of all keyframes that it ever had here, also
+    those that were removed."""
 
     key: str
     hello: Hello
     odometry_base: OdometryBase | None
     last_correction_event: MapEvent | None = None
     credential: str | None = ""
+    next_id: int = 0
 
     @property
     def next_keyframe(self) -> int:
         """Id of the keyframe that the edge asks for."""
-        return 0 if self.odometry_base is None else self.odometry_base.id + 1
+        return max(self.next_id, 0 if self.odometry_base is None else self.odometry_base.id + 1)
 
     @classmethod
     def from_peer(cls, peer: Peer) -> RestoredRun:
         """Return a run as it is now: its keyframes are all stored."""
-        return cls(peer.key, peer.hello, peer.odometry_base, peer.last_correction_event, peer.credential)
+        return cls(
+            key=peer.key,
+            hello=peer.hello,
+            odometry_base=peer.odometry_base,
+            last_correction_event=peer.last_correction_event,
+            credential=peer.credential,
+            next_id=peer.durable_below,
+        )
 
     def peer(self, session: int) -> Peer:
         """Return the absent run, which may resume where it was. session: of the edge."""
@@ -293,6 +304,7 @@ class RestoredRun:
             reorder_buffer=ReorderBuffer(self.next_keyframe),
             durable_below=self.next_keyframe,
             odometry_base=self.odometry_base,
+            forgotten_below=self.next_keyframe,
             is_gone=True,
             last_correction_event=self.last_correction_event,
             is_welcomed=False,
@@ -302,7 +314,7 @@ class RestoredRun:
 
 
 def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRun]:
-    """Return the runs of all earlier sessions; each continues after its last stored keyframe.
+    """Return the runs of all earlier sessions; each continues after the last keyframe that it ever had here.
 
     position_sigma_m: standard deviation of a run's position in another agent's map until that is solved
     again. Runs in maps that loops have merged since the poses were stored get their correction from that
@@ -325,5 +337,6 @@ def restored_runs(stored: StoredMap, position_sigma_m: float) -> list[RestoredRu
                 cov = None if is_own_map else se3.inverse_cov(keyframe.T_odom_body, cov_body)
                 with contextlib.suppress(ValueError):  # beyond all measure: this run waits for a solution
                     map_event = map_assignment(run.run_key, map_id, T_map_odom, keyframe.id, cov)
-        out.append(RestoredRun(run.run_key, run.hello, base, map_event, run.credential))
+        next_id = stored.next_ids.get(run.run_key, 0)
+        out.append(RestoredRun(run.run_key, run.hello, base, map_event, run.credential, next_id))
     return out

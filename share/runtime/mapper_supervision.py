@@ -36,6 +36,7 @@ class MapperRestarts:
         """known_m: see `share.protocol.peer.restored_runs`. has_keys: agents of this edge have keys."""
         self.store = store  # None also once a read-only map is no longer used
         self.objects: Sequence[SaveObject] | None = None  # of the room; None before the map was loaded
+        self.forgotten: Mapping[str, int] | None = None  # as in `StoredMap`; None likewise
         self._known_m, self._notify, self._has_keys = known_m, notify, has_keys
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring, self._restored_keyframes = False, 0
@@ -90,6 +91,7 @@ class MapperRestarts:
         try:
             restore, outline = RestoreMap(self.store.rows(), self._has_keys), self.store.outline()
             outline = with_unknown_credentials(outline) if self._has_keys else outline
+            self.forgotten = outline.forgotten if self.forgotten is None else self.forgotten
             known = restored_runs(outline, self._known_m)
             self.objects = outline.objects if self.objects is None else self.objects
         except ShareError:

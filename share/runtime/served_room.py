@@ -261,8 +261,15 @@ class ServedRoom:
         self, restore: RestoreMap | None, known: list[RestoredRun], start_delay_s: float
     ) -> None:
         store, writable = self._restarts.store, self._restarts.writable
-        session, objects = secrets.randbits(63), self._restarts.objects or ()
-        self._state_machine = EdgeProtocol(self._settings, session, writable, known, self._start_ns, objects)
+        self._state_machine = EdgeProtocol(
+            self._settings,
+            secrets.randbits(63),
+            writable,
+            known,
+            self._start_ns,
+            self._restarts.objects or (),
+            forgotten=self._restarts.forgotten,
+        )
         if self._others is not None:
             self._others.note_session()
         has_others = self._others is not None
@@ -288,6 +295,7 @@ class ServedRoom:
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
             self._restarts.objects = self._state_machine.room.kept_objects()
+            self._restarts.forgotten = self._state_machine.forgotten_next_keyframes()
             loaded = self._load_stored_map()
             self.end_totals()
             self._start_session(loaded, pause_s)

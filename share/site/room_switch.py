@@ -33,8 +33,8 @@ class RoomPort(Protocol):
     """What the switch needs of a room. Runs go by their keys."""
 
     def knows(self, peer_id: bytes) -> int | None:
-        """Return the number of keyframes that a run of this peer has sent, 0 for a client; None if the room
-        knows neither."""
+        """Return the number of keyframes that a run of this peer has sent, also one that was forgotten, 0 for
+        a client; None if the room knows neither."""
 
     def is_present(self, name: str) -> bool:
         """Return whether a run of this name takes part."""

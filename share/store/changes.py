@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Mapping
 from typing import Any
 
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import (
+    MAX_FORGOTTEN_RUNS,
     MapChange,
     RemoveKeyframes,
     RemoveLoops,
@@ -22,7 +24,8 @@ from share.mapping.map_changes import (
     SaveView,
 )
 from share.store import rows
-from share.store.rows import COLUMNS, insert
+from share.store.rows import COLUMNS, FORGOTTEN_PREFIX, insert
+from share.wire.messages import public_tag
 
 _RUN_COLUMNS = (
     *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
@@ -71,8 +74,9 @@ def apply_change(db: sqlite3.Connection, change: MapChange, now_s: float) -> Non
 
 def _insert_run(db: sqlite3.Connection, change: SaveRun) -> None:
     if not first_row(db, "SELECT 1 FROM run WHERE key = ?", change.run_key):
+        next_id = _take_forgotten(db, public_tag(change.hello.run_id))
         for table in ("run", "run_copy"):
-            insert(db, table, rows.run_row(change, 0))
+            insert(db, table, rows.run_row(change, next_id))
         _set_credential(db, change.run_key, change.credential)
 
 
@@ -137,9 +141,33 @@ def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
 
 
 def _delete_run(db: sqlite3.Connection, run: str) -> None:
+    """Remove a run with its name; where keyframes of it were removed, it stays known by its tag."""
+    row = first_row(db, "SELECT key, next, codec, hello FROM run WHERE key = ?", run)
+    if row and (next_id := _next_id(db, run)):
+        add_forgotten(db, {public_tag(rows.read_run(row).hello.run_id): next_id})
     for table, column in _RUN_COLUMNS:
         db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
     _set_credential(db, run, None)
+
+
+def add_forgotten(db: sqlite3.Connection, next_ids: Mapping[str, int]) -> None:
+    """Record removed runs by tag, each with the id after all that it had; of too many drop the oldest."""
+    for tag, next_id in next_ids.items():
+        row = rows.forgotten_row(tag, next_id)
+        db.execute("DELETE FROM about WHERE name = ?", row[:1])
+        insert(db, "about", row)
+    (count,) = first_row(db, "SELECT count(*) FROM about WHERE name GLOB ?", f"{FORGOTTEN_PREFIX}*")
+    oldest = "SELECT number FROM about NOT INDEXED WHERE name GLOB ? ORDER BY number LIMIT ?"
+    if (excess := count - MAX_FORGOTTEN_RUNS) > 0:
+        db.execute(f"DELETE FROM about WHERE number IN ({oldest})", (f"{FORGOTTEN_PREFIX}*", excess))
+
+
+def _take_forgotten(db: sqlite3.Connection, tag: str) -> int:
+    """Return the id after all that a run had before it was removed, 0 if it is new, and drop the record."""
+    name = f"{FORGOTTEN_PREFIX}{tag}"
+    about = db.execute("SELECT name, value FROM about WHERE name = ?", (name,)).fetchall()
+    db.execute("DELETE FROM about WHERE name = ?", (name,))
+    return rows.read_forgotten_runs([(0, row) for row in about])[0].get(tag, 0)
 
 
 def _store_next_id(db: sqlite3.Connection, run: str, next_id: int) -> None:

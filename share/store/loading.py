@@ -32,7 +32,8 @@ from share.store.salvage import (
 from share.types import Keyframe
 
 _RECONNECTED = "keyframes lost their predecessor and are linked to an earlier one"
-_ABOUT_LOST = "rows about the file and the credentials of runs could not be read"
+_ABOUT_LOST = "rows about the file, the credentials of runs and forgotten runs could not be read"
+_FORGOTTEN_LOST = "forgotten runs could not be read: their agents may send what was deleted again"
 _OBJECTS_LEFT_OUT = f"objects of the room are too many ({MAX_OBJECTS} at most) and stay in the file unused"
 _SOLUTIONS_LOST = "solutions could not be read: keyframes are placed by odometry and loops"
 
@@ -172,8 +173,9 @@ def _outline(read_rows: ReadRows) -> StoredMap:
     links = [rows.read_link(row) for row in tables["link"] if row[0] in chosen and row[:2] not in posed]
     next_ids = {row[0]: row[1] for row in tables["run"]}
     objects, lost_objects = rows.read_objects(read_rows.tables["about"])
-    if lost_objects or len(objects) > MAX_OBJECTS:
-        raise ValueError("objects")
+    forgotten, lost_forgotten = rows.read_forgotten_runs(read_rows.tables["about"])
+    if lost_objects or len(objects) > MAX_OBJECTS or lost_forgotten:
+        raise ValueError("objects, or forgotten runs")
     return StoredMap(
         tuple(replace(run, credential=credentials.get(key, "")) for key, run in runs.items()),
         (),
@@ -183,6 +185,7 @@ def _outline(read_rows: ReadRows) -> StoredMap:
         solved,
         {key: max(next_ids[key], newest.get(key, -1) + 1) for key in runs},
         objects=objects,
+        forgotten=forgotten,
     )
 
 
@@ -206,6 +209,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
     connected_loops = tuple(loop for loop in loops if loop.a in known_keys and loop.b in known_keys)
     segments, lost_segments = _decode_rows(read_rows, "stretch", rows.read_segment)
     objects, lost_objects = rows.read_objects(read_rows.tables["about"])
+    forgotten, lost_forgotten = rows.read_forgotten_runs(read_rows.tables["about"])
     complaints = [
         _loss_line(read_rows, "about", read_rows.lost_counts["about"], _ABOUT_LOST),
         _loss_line(read_rows, "run", lost_runs, "agent runs could not be read"),
@@ -219,6 +223,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _loss_line(read_rows, "poses", lost_poses, _SOLUTIONS_LOST),
         _loss_line(read_rows, "", lost_objects, "objects of the room could not be read"),
         _loss_line(read_rows, "", max(0, len(objects) - MAX_OBJECTS), _OBJECTS_LEFT_OUT),
+        _loss_line(read_rows, "", lost_forgotten, _FORGOTTEN_LOST),
     ]
     return StoredMap(
         tuple(runs.values()),
@@ -230,6 +235,7 @@ def decode_map(read_rows: ReadRows) -> StoredMap:
         _next_ids(next_ids, repaired.keyframes),
         tuple(line for line in complaints if line),
         objects,
+        forgotten,
     )
 
 

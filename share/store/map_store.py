@@ -16,8 +16,8 @@ from share.errors import StoreError, UsageError
 from share.files.sqlite_file import wal_path
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, StoredMap, Wipe
-from share.store import database, schema
-from share.store.changes import apply_change, first_row
+from share.store import database, rows, schema
+from share.store.changes import add_forgotten, apply_change, first_row
 from share.store.database import DamageError, is_map, why_not_written
 from share.store.loading import (
     OpenedMap,
@@ -212,16 +212,22 @@ class MapStore:
         return read_intact_rows(self._db, schema.SMALL_TABLES)
 
     def set_aside(self) -> Path:
-        """Rename the map and start an empty one in its place. Return the new name of the old one.
+        """Rename the map and start an empty one in its place, which knows the removed runs too. Return the
+        new name of the old one.
 
-        Raises ShareError if that fails: then the map is unchanged.
+        Raises ShareError if that fails: then the map is unchanged, or the new one knows none.
         """
+        about = read_intact_rows(self._writable_db(), ["about"]).tables["about"]
         self._writable_db().close()
         try:
-            return set_aside(self.path)
+            renamed = set_aside(self.path)
         finally:
             self._opened = self._outline = None
             self._start_writing()
+        with database.translate_errors(self.path, "written"), self._writable_db() as db:
+            db.execute("BEGIN IMMEDIATE")
+            add_forgotten(db, rows.read_forgotten_runs(about)[0])
+        return renamed
 
     def close(self) -> None:
         """Checkpoint the log and unlock the file."""

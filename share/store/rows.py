@@ -48,6 +48,7 @@ COLUMNS = {
 
 _OBJECT_PREFIX = "object "  # before an object's id, a name in `about`; an older SHARE ignores it
 _CREDENTIAL_PREFIX = "voice "  # before a run's key, a name in `about`; SHARE 0.1 ignores it
+FORGOTTEN_PREFIX = "forgotten "  # before the tag of a removed run, a name in `about`; likewise
 _READABLE_VERSIONS = (
     3,
     4,
@@ -95,6 +96,11 @@ def run_row(run: SaveRun, next_keyframe: int) -> Row:
 def credential_row(run: str, credential: str) -> Row:
     """Return the row of `about` with the public key of a run. A run without a key has no row."""
     return _CREDENTIAL_PREFIX + run, credential
+
+
+def forgotten_row(tag: str, next_keyframe: int) -> Row:
+    """Return the row of `about` of a removed run: its `public_tag`, and the id after all that it had."""
+    return FORGOTTEN_PREFIX + tag, str(next_keyframe)
 
 
 def object_name(object_id: int) -> str:
@@ -165,6 +171,21 @@ def read_credentials(about: list[tuple[int, Row]]) -> dict[str, str]:
         for name, value in texts.items()
         if name.startswith(_CREDENTIAL_PREFIX)
     }
+
+
+def read_forgotten_runs(about: list[tuple[int, Row]]) -> tuple[dict[str, int], int]:
+    """Return the next keyframes of removed runs by tag, oldest first, from the rows of `about`, and the
+    number of unreadable ones."""
+    out, lost_count = dict[str, int](), 0
+    for _, (name, value) in about:
+        if isinstance(name, str) and name.startswith(FORGOTTEN_PREFIX):
+            try:
+                next_keyframe = checked_id("next", int(_checked_text(value)))
+            except ValueError:
+                lost_count += 1
+            else:
+                out[name.removeprefix(FORGOTTEN_PREFIX)] = next_keyframe
+    return out, lost_count
 
 
 class _ObjectFields(msgspec.Struct):

@@ -142,6 +142,8 @@ def _write_rows(read_rows: ReadRows, part: Path) -> None:
                 insert(connection, "about", rows.credential_row(run, credential))
         for stored in rows.read_objects(read_rows.tables["about"])[0]:
             insert(connection, "about", rows.object_row(stored))
+        for forgotten in rows.read_forgotten_runs(read_rows.tables["about"])[0].items():
+            insert(connection, "about", rows.forgotten_row(*forgotten))
         for statement in _DELETE_ORPHANS:
             connection.execute(statement)
         if not read_rows.tables["image"]:  # the file may be of an older schema

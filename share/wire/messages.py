@@ -39,7 +39,12 @@ def peer_id(run_id: int) -> bytes:
 
 def public_tag(run_id: int) -> str:
     """Return 16 hexadecimal digits that name a run publicly without revealing its `run_id`."""
-    return hashlib.sha256(peer_id(run_id)).hexdigest()[:16]
+    return peer_tag(peer_id(run_id))
+
+
+def peer_tag(peer: bytes) -> str:
+    """Return the `public_tag` of the run with this transport id."""
+    return hashlib.sha256(peer).hexdigest()[:16]
 
 
 def _check_image_size(camera: Camera) -> None:

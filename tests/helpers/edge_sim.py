@@ -220,8 +220,13 @@ class Town:
                     self._mapped(edge, edge.mapper.add_keyframe(key, keyframe, is_extra))
                 case ed.DropRun(key):
                     edge.mapper.remove_run(key)
+                case ed.SaveChanges():
+                    self.save(edge, effect)
                 case ed.WriteEvent(fields):
                     self.records.append(fields)
+
+    def save(self, edge: ModelRun, effect: ed.SaveChanges) -> None:
+        """This edge has no map file."""
 
     def _mapped(self, edge: ModelRun, map_events: list[MapEvent]) -> None:
         """The mapper has decided something, and goes on to its next steps, each in its own time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from helpers.edge_sim import MS, ModelRun, Person, Town, Walls, look
 from share.config import Config
 from share.geometry import se3
 from share.mapping.corrections import MapEvent
+from share.mapping.map_changes import StoredMap
 from share.mapping.mapper import Mapper
 from share.mapping.places import FindKeyframe, PlaceNewsLog
 from share.mapping.steps import SolveStep, Step
@@ -17,20 +19,34 @@ from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.common_events import EdgeMessageReceived, Tick
 from share.protocol.edge import EdgeProtocol
-from share.protocol.peer import Peer
+from share.protocol.peer import Peer, restored_runs
 from share.site.directory import PlaceDirectory
 from share.site.room_switch import RoomSwitch
+from share.store.map_store import MapStore
 from share.types import F64, View
 
 
 class SimRoom(ModelRun):
     """A room: state machine, mapper and solver, and what the switch asks of it."""
 
-    def __init__(self, name: str, site: Site, config: Config, session: int, has_store: bool) -> None:
+    def __init__(
+        self,
+        name: str,
+        site: Site,
+        config: Config,
+        session: int,
+        has_store: bool,
+        store: MapStore | None = None,
+    ) -> None:
+        """store: its map file, of which it continues the map."""
         super().__init__(config, session)
-        self.name, self._site = name, site
-        self.machine = EdgeProtocol(config, session, has_store)
+        self.name, self.store, self._site = name, store, site
+        kept = StoredMap() if store is None else store.load()
+        restored = restored_runs(kept, config.merge.enter_m)
+        self.machine = EdgeProtocol(config, session, has_store, restored, forgotten=kept.forgotten)
         self.mapper = Mapper(config, news=PlaceNewsLog())
+        if kept.runs:
+            self.mapper.restore(kept)
 
     def knows(self, peer_id: bytes) -> int | None:
         return self.machine.knows(peer_id)
@@ -62,7 +78,8 @@ class SimRoom(ModelRun):
 
 
 class Site(Town):
-    """Rooms by name, their directory, and everybody. The disk of a room answers after `disk_ms`."""
+    """Rooms by name, their directory, and everybody. The disk of a room answers after `disk_ms`; `folder`: of
+    the rooms' map files."""
 
     def __init__(
         self,
@@ -70,16 +87,38 @@ class Site(Town):
         rooms: tuple[str, ...],
         refused: frozenset[tuple[str, str]] = frozenset(),
         disk_ms: float | None = None,
+        folder: Path | None = None,
         **changes: Any,
     ) -> None:
         super().__init__(people, **changes)
-        self._disk_ms = disk_ms
+        self._disk_ms = 0.0 if disk_ms is None and folder is not None else disk_ms
+        self._names, self._refused, self._folder = rooms, refused, folder
+        self.start(100)
+
+    def start(self, session: int) -> None:
+        """Start all rooms, also again; session: of the first."""
         self.rooms = {
-            name: SimRoom(name, self, self.config, 100 + i, disk_ms is not None)
-            for i, name in enumerate(rooms)
+            name: SimRoom(
+                name, self, self.config, session + i, self._disk_ms is not None, self._open_store(name)
+            )
+            for i, name in enumerate(self._names)
         }
         self.directory = PlaceDirectory()
-        self.switch = RoomSwitch(self.rooms, lambda room, name: (room, name) not in refused)
+        self.switch = RoomSwitch(self.rooms, lambda room, name: (room, name) not in self._refused)
+
+    def stop(self) -> None:
+        """End all rooms, as by a crash: what has not reached the disk is lost."""
+        self._later.clear()
+        for room in self.rooms.values():
+            if room.store is not None:
+                room.store.close()
+
+    def map_file(self, room: str) -> Path:
+        assert self._folder is not None
+        return self._folder / f"{room}.sqlite"
+
+    def _open_store(self, room: str) -> MapStore | None:
+        return None if self._folder is None else MapStore.open(self.map_file(room))
 
     def to_edge(self, event: ed.EdgeEvent) -> None:
         if isinstance(event, ed.PeerMessageReceived):
@@ -110,7 +149,9 @@ class Site(Town):
                     self.continue_mapping(room, room.mapper.add_keyframe(key, keyframe, is_extra))
                 case ed.DropRun(key):
                     room.mapper.remove_run(key)
-                case ed.SaveChanges(ticket):
+                case ed.SaveChanges(ticket, changes):
+                    if room.store is not None:
+                        room.store.write(changes)
                     if self._disk_ms is not None:
                         saved = ed.ChangesSaved(ticket)
                         self._in(round(self._disk_ms * MS), lambda saved=saved: self._tell(room, saved))

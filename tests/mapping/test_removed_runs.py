@@ -12,6 +12,8 @@ from helpers.hellos import hello_of
 
 from share.config import Config
 from share.geometry import se3
+from share.mapping.corrections import map_assignment
+from share.mapping.forgetting import DAY_S
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_changes import RemoveKeyframes, RemoveRun
 from share.mapping.mapper import Mapper
@@ -27,7 +29,8 @@ from share.wire.codec import decode, encode
 S = 1_000_000_000
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 MOST = 60
-CONFIG = replace(Config(), edge=replace(Config().edge, max_keyframes=MOST))
+CONFIG = replace(Config(), edge=replace(Config().edge, max_keyframes=MOST, keep_days=1.0))
+NOW_S = 1_800_000_000.0
 
 
 def at(x: float) -> F64:
@@ -40,7 +43,8 @@ class Session:
     def __init__(self, store: MapStore, session: int = 7) -> None:
         kept = store.load()
         self.store, self.mapper = store, Mapper(CONFIG)
-        self.edge = EdgeProtocol(CONFIG, session, has_store=True, restored=restored_runs(kept, 0.05))
+        restored = restored_runs(kept, 0.05)
+        self.edge = EdgeProtocol(CONFIG, session, True, restored, forgotten=kept.forgotten)
         if kept.runs:
             self.mapper.restore(kept)
         self.sent: list[m.Message] = []
@@ -126,18 +130,127 @@ def test_the_remaining_map_is_restored(tmp_path: Path) -> None:
         assert len(second.mapper.current_poses().keys) <= 1.05 * MOST
 
 
-def test_a_removed_run_that_returns_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def keyframes_of(store: MapStore, run_id: int) -> set[int]:
+    """Ids of eve's keyframes of this run in the file."""
+    run = f"eve-{m.public_tag(run_id)[:4]}"
+    return {k.keyframe_key.id for k in store.load().keyframes if k.run_key == run}
+
+
+def returned(session: Session, run_id: int, count: int) -> list[m.Message]:
+    """A run of eve says hello, sends its first `count` keyframes again, and two new ones. Return the
+    answers."""
+    session.sent.clear()
+    session.tell(run_id, hello_of("eve", run_id))
+    for k in range(count + 2):
+        step, before = (at(k), -1) if k == 0 else (at(1.0), k - 1)
+        own = Keyframe(k, before, k * S, step, 1e-6 * np.eye(6), at(k), np.zeros(3), 0.0, EMPTY, k - 1)
+        session.tell(run_id, own)
+    return session.sent
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_removed_run_that_returns_goes_on_with_new_keyframes(tmp_path: Path, restarts: bool) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
-        session = crowded(store)
-        session.tell(100, hello_of("eve", 100))
-        refused = session.sent[-1]
-        assert isinstance(refused, m.Refused)
-        assert "start the agent again" in refused.reason
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 8)
+        emptied(session, 100)
+        assert [run.hello.name for run in store.load().runs] == ["ann"]
+        session = Session(store, session=8) if restarts else session
         session.now_ns += 100 * S
-        session.tell(999, hello_of("eve", 999))
-        welcome, rate = session.sent[-2:]
-        assert isinstance(welcome, m.Welcome)
-        assert isinstance(rate, m.Rate)
+        answers = returned(session, 100, 8)
+        assert m.Welcome(8 if restarts else 7, 8) in answers
+        assert [one.next_keyframe for one in answers if isinstance(one, m.Ack)] == [8] * 8 + [9, 10]
+        assert keyframes_of(store, 100) == {8, 9}
+        held = {key.id for key in session.mapper.current_poses().keys if key.agent.startswith("eve")}
+        assert held == {8, 9}
+        assert store.load().problems == ()
+        third = Session(store, session=9)
+        third.now_ns += 200 * S
+        assert m.Welcome(9, 10) in returned(third, 100, 10)
+        assert keyframes_of(store, 100) == {8, 9, 10, 11}
+
+
+def test_a_run_that_returned_and_left_without_a_keyframe_is_still_known(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 8)
+        emptied(session, 100)
+        session.run("eve", 100, 0)
+        for k in range(300):  # so that it is no longer among the runs that left without a keyframe
+            session.run(f"n{k}", 1000 + k, 0)
+        assert "eve" not in session.edge.report({})["agents"]
+        assert m.Welcome(7, 8) in returned(session, 100, 8)
+
+
+def test_a_connected_run_whose_keyframes_expired_is_known_after_a_restart(tmp_path: Path) -> None:
+    """The file has its row, and no keyframe of it."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("eve", 100, 8, stays=True)
+        session.tell(100, m.Ping(0, 0))
+        for late_s in (0, DAY_S):
+            session.handle(ed.MapperResult(tuple(session.mapper.expire(NOW_S + late_s))))
+        assert [run.hello.name for run in store.load().runs] == ["eve"]
+        assert keyframes_of(store, 100) == set()
+        second = Session(store, session=8)
+        assert m.Welcome(8, 8) in returned(second, 100, 8)
+        assert keyframes_of(store, 100) == {8, 9}
+
+
+def test_removed_keyframes_at_the_end_of_a_run_are_not_requested_again(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 20)
+        session.run("eve", 101, 1)
+        atlas, eve = session.mapper.atlas, f"eve-{m.public_tag(100)[:4]}"
+        newest = {(eve, k) for k in range(8, 20)}
+        session.mapper.remove_keyframes([n for n in atlas.graph.poses if atlas.key(n) in newest])
+        session.handle(Tick())
+        assert keyframes_of(store, 100) == set(range(8))
+        second = Session(store, session=8)
+        assert m.Welcome(8, 20) in returned(second, 100, 20)
+        assert keyframes_of(store, 100) == {*range(8), 20, 21}
+        assert second.edge.report({})["agents"]["eve"]["suspect_keyframes"] == 0
+
+
+def test_a_forgotten_run_that_only_pings_is_asked_for_a_hello(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        session.run("eve", 100, 8)
+        emptied(session, 100)
+        for run_id, answered in ((100, 0), (999, 7)):  # 999: never joined
+            session.tell(run_id, m.Ping(1, 0))
+            pong = session.sent[-1]
+            assert isinstance(pong, m.Pong) and pong.session == answered
+        returned(session, 100, 8)
+        session.tell(100, m.Ping(2, 0))
+        pong = session.sent[-1]
+        assert isinstance(pong, m.Pong) and pong.session == 7
+
+
+def test_corrections_of_a_run_that_returns_are_newer_than_those_before(tmp_path: Path) -> None:
+    """Its agent has not noticed, and leaves out corrections that seem older."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        session = Session(store)
+        session.run("ann", 1, 2, stays=True)
+        assert revisions(session, 100, 3) == [1, 2, 3]
+        session.tell(100, m.Bye())
+        emptied(session, 100)
+        session.now_ns += 100 * S
+        assert revisions(session, 100, 1) == [4]
+
+
+def revisions(session: Session, run_id: int, count: int) -> list[int]:
+    """A run of eve comes with keyframes and is sent so many corrections. Return their revisions."""
+    returned(session, run_id, 1)
+    key = f"eve-{m.public_tag(run_id)[:4]}"
+    for _ in range(count):
+        session.handle(ed.MapperResult((map_assignment(key, f"{key}/0", np.eye(4), 2),)))
+    return [one.revision for one in session.sent if isinstance(one, m.Correction)]
 
 
 def test_a_run_that_returns_before_it_is_removed_continues(tmp_path: Path) -> None:
@@ -199,8 +312,8 @@ def test_a_run_is_removed_after_a_crash_before_its_removal(tmp_path: Path) -> No
         assert len(store.load().runs) == 2
 
 
-def test_a_run_left_by_such_a_crash_begins_a_new_segment(tmp_path: Path) -> None:
-    """Its agent connects first. Its keyframes are stored, though their ids were used."""
+def test_a_run_left_by_such_a_crash_goes_on_with_new_keyframes(tmp_path: Path) -> None:
+    """Its agent connects first, and sends the removed keyframes once more."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         session = crowded(store, runs=1)
         gone = next(run for run in session.mapper.report()["agents"] if run.startswith("eve"))
@@ -208,9 +321,8 @@ def test_a_run_left_by_such_a_crash_begins_a_new_segment(tmp_path: Path) -> None
             [RemoveKeyframes(tuple(k.keyframe_key for k in store.load().keyframes if k.run_key == gone))]
         )
         second = Session(store, session=8)
-        second.run("eve", 100, 3)
-        assert second.sent[0] == m.Welcome(8, 0)
-        assert [k.keyframe_key.id for k in store.load().keyframes if k.run_key == gone] == [0, 1, 2]
+        assert returned(second, 100, 8)[0] == m.Welcome(8, 8)
+        assert keyframes_of(store, 100) == {8, 9}
 
 
 def test_runs_without_a_keyframe_are_removed_from_the_mapper(tmp_path: Path) -> None:

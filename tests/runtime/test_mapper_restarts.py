@@ -15,6 +15,8 @@ from helpers.map_changes import ANN, BOB, small_map
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
 from share.mapping.corrections import MapEvent
+from share.mapping.loops import KeyframeKey
+from share.mapping.map_changes import RemoveKeyframes, RemoveRun
 from share.net.transport import IncomingMessage
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
@@ -27,6 +29,7 @@ from share.runtime.mapper_supervision import MapperRestarts
 from share.runtime.worker_process import END
 from share.store.map_store import MapStore
 from share.store.schema import PAGE_BYTES
+from share.wire.messages import public_tag
 
 
 class Link:
@@ -136,6 +139,24 @@ def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
     assert pauses[:5] == [1, 2, 4, 8, 16]
     assert not reasons(events, "map")
     assert not path.with_name("room.sqlite.damaged-1").exists()
+
+
+def test_forgotten_runs_are_known_from_the_file_and_after_a_restart(edge, path, monkeypatch):
+    with MapStore.open(path) as store:
+        store.write([RemoveKeyframes(tuple(KeyframeKey(ANN, i) for i in range(20))), RemoveRun(ANN)])
+    given = []
+    init = EdgeProtocol.__init__
+    monkeypatch.setattr(
+        EdgeProtocol,
+        "__init__",
+        lambda self, *args, forgotten=None, **rest: (
+            given.append(dict(forgotten)) or init(self, *args, forgotten=forgotten | {"00": 7}, **rest)
+        ),
+    )
+    edge(dies_later)
+    until(lambda: len(given) >= 2)
+    of_the_file = {public_tag(1): 20}
+    assert given[:2] == [of_the_file, of_the_file | {"00": 7}]  # what a session has forgotten, the next knows
 
 
 def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):

@@ -112,7 +112,13 @@ class Simulation:
         """Start edge and mapper with what the store keeps, or empty."""
         kept = StoredMap() if self._store is None else self._store.load()
         restored = restored_runs(kept, self._config.merge.enter_m)
-        self.edge = EdgeProtocol(self._config, session, has_store=self._store is not None, restored=restored)
+        self.edge = EdgeProtocol(
+            self._config,
+            session,
+            has_store=self._store is not None,
+            restored=restored,
+            forgotten=kept.forgotten,
+        )
         archive = None if self._store is None else KeyframeArchive(self._store.path)
         self.mapper = Mapper(self._config, archive) if mapper is None else mapper
         if kept.runs:
