@@ -309,12 +309,6 @@ class EdgeProtocol:
         """Whether neither a run nor a client takes part."""
         return not self._registry.present() and not any(True for _ in self.room.clients)
 
-    def peers(self) -> dict[bytes, int]:
-        """Return `knows` of each run and client that is known."""
-        return {peer_id: peer.reorder_buffer.next_keyframe for peer_id, peer in self._registry.items()} | {
-            client.id: 0 for client in self.room.clients
-        }
-
     def run(self, key: str) -> Peer | None:
         """Return the run of this key; None if it is not known."""
         return self._registry.by_key.get(key)

@@ -93,13 +93,13 @@ class RoomKeeper:
         self._failure = ""  # why the map file cannot be opened
         self._retry_s = 0.0  # monotonic, as below
         self._backoff = Backoff(time.monotonic_ns())
-        self._peers: dict[bytes, int] = {}  # that a sleeping room knows
         self._last_report: dict[str, Any] = {}
         self._last_series: Mapping[str, Mapping[str, Any]] = {}
         self._used_s = time.monotonic()
         self._closing: ServedRoom | None = None  # as long as the thread closes it
         self._closed_stamp: FileStamp | None = None  # of the map file as the room has left it
         self._room: ServedRoom | None = serve(store, self._totals, False)
+        self._last_protocol = self._room.protocol  # of a sleeping room: nothing changes in it
 
     @property
     def room(self) -> ServedRoom | None:
@@ -116,7 +116,7 @@ class RoomKeeper:
         says hello."""
         if self._room is not None:
             self._room.handle(event)
-        elif event.peer_id in self._peers or _is_hello(event):
+        elif self.knows(event.peer_id) is not None or _is_hello(event):
             self._messages.append(event)
             self._is_called = True
 
@@ -131,7 +131,7 @@ class RoomKeeper:
 
     def knows(self, peer_id: bytes) -> int | None:
         """As `EdgeProtocol.knows`, also of a sleeping room."""
-        return self._peers.get(peer_id) if self._room is None else self._room.protocol.knows(peer_id)
+        return (self.protocol or self._last_protocol).knows(peer_id)
 
     def step(self) -> None:
         """Handle the answers of the room's processes, and the time that has passed."""
