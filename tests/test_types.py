@@ -117,7 +117,7 @@ def test_a_keyframe_is_relative_to_keyframes_before_it(ids: list[int]) -> None:
 
 @pytest.mark.parametrize(
     ("size", "sign", "reason"),
-    [(1.7e308, -1, "exceeds 1e12"), (2e12, 1, "exceeds 1e12"), (1, -1, "symmetric")],
+    [(1.7e308, -1, "exceeds"), (2e12, 1, "exceeds"), (1, -1, "symmetric")],
 )
 def test_a_covariance_of_any_size_is_refused_in_words_alone(size, sign, reason, recwarn):
     """numpy's warnings would go to the log of an edge."""

@@ -165,8 +165,8 @@ class RoomKeeper:
     # ------------------------------------------------------------------ sleep
 
     def _fall_asleep(self, room: ServedRoom) -> None:
-        self._peers, self._last_series, self._last_report = (
-            room.protocol.peers(),
+        self._last_protocol, self._last_series, self._last_report = (
+            room.protocol,
             room.series(),
             room.report(),
         )
