@@ -77,11 +77,9 @@ def _by_map_poses(graph: MapGraph, node_id: int, own: Sequence[int]) -> tuple[se
 
 def larger_maps_first(graph: MapGraph, others: Sequence[int]) -> list[int]:
     """Sort candidates: those in larger maps first, so that agents end up in one map."""
-    nodes = graph.odometry.nodes
-    sizes: Counter[int] = Counter()
-    for segment, reference_segment in zip(graph.odometry.segments, graph.reference_segments, strict=True):
-        sizes[reference_segment] += len(segment.nodes)
-    return sorted(others, key=lambda n: -sizes[graph.reference_segments[nodes[n].segment]])
+    maps = {n: graph.reference_segments[graph.odometry.nodes[n].segment] for n in others}
+    sizes = {reference_segment: graph.map_size(reference_segment) for reference_segment in set(maps.values())}
+    return sorted(others, key=lambda n: -sizes[maps[n]])
 
 
 # ---- Keyframes near one by the map's poses

@@ -56,6 +56,7 @@ class EdgeProtocol:
         trackers: RunTrackers | None = None,
     ) -> None:
         self._config, self._session, self._registry = config, session, RunRegistry()
+        self._config_report = to_mapping(config)
         for run in restored:
             self._registry.restore(run, session)
         self.latest_poses = self._registry.latest_poses
@@ -124,6 +125,8 @@ class EdgeProtocol:
     def _on_message(self, event: ed.PeerMessageReceived) -> None:
         peer, client = self._registry.get(event.peer_id), self.room.clients.get(event.peer_id)
         sender = client or self._registry.sender(event.peer_id)
+        if peer is not None and peer.is_gone:
+            self._registry.mark_heard(peer)
         sender.counts["bytes_up"] += message_bytes(event.frames)
         try:
             message = decode(event.frames)
@@ -343,8 +346,8 @@ class EdgeProtocol:
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, with `agents` by run key. Names of
-        runs are `RunRegistry.label`."""
-        peers, mapped = self._registry.values(), map_report.get("agents", {})
+        runs are `RunRegistry.label`. Of absent runs it lists the recent ones and counts the rest."""
+        peers, mapped = self._registry.listed(self._config.edge.max_agents), map_report.get("agents", {})
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
@@ -353,6 +356,7 @@ class EdgeProtocol:
                 self._registry.label(peer): self._peer_report(peer) | mapped.get(peer.key, {})
                 for peer in peers
             },
+            "unlisted_runs": len(self._registry) - len(peers),
             "unjoined": dict(self._registry.unjoined.counts),
             "refused": [
                 *filter(None, [self._rate_scheduler.full_reason(self._out.now_ns)]),
@@ -363,5 +367,5 @@ class EdgeProtocol:
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,
             "version": __version__,
-            "config": to_mapping(self._config),
+            "config": self._config_report,
         }
