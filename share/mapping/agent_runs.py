@@ -1,7 +1,7 @@
 """The runs of each agent: which are present, which is the latest of a name, and which ones a report lists.
 
-An edge that ten agents use ten times a day knows thousands of runs after a month, and its map file keeps them.
-So nothing that is done for each message, keyframe or report looks at all of them.
+An edge that ten agents use ten times a day knows thousands of runs after a month, and its map file keeps
+them. So nothing that is done for each message, keyframe or report looks at all of them.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ class AgentRuns:
     def __init__(self) -> None:
         self._count = 0
         self._runs: dict[str, _Run] = {}
-        self._by_name: dict[
-            str, dict[str, None]
-        ] = {}  # the latest last; the name whose latest is newest last
+        # Dicts as ordered sets, in which who came or left last is last:
+        self._by_name: dict[str, dict[str, None]] = {}
         self._present: dict[str, None] = {}
-        self._absent: dict[str, None] = {}  # the one that left last is last
+        self._absent: dict[str, None] = {}
 
     def __contains__(self, run: object) -> bool:
         return run in self._runs

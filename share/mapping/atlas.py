@@ -35,9 +35,9 @@ from share.types import F64, Keyframe
 class Atlas:
     """All keyframes of all agents, in maps. Keyframes are numbered by node ids.
 
-    graph: poses, edges and maps. runs: who is present. quarantine: agents that are kept apart. loop_acceptance: loops between two
-    maps and within one. solving: jobs of the solver and their solutions. culling: keyframes to remove.
-    renewal: keyframes of earlier sessions that show what is gone.
+    graph: poses, edges and maps. runs: who is present. quarantine: agents that are kept apart.
+    loop_acceptance: loops between two maps and within one. solving: jobs of the solver and their solutions.
+    culling: keyframes to remove. renewal: keyframes of earlier sessions that show what is gone.
     """
 
     def __init__(self, config: MergeConfig, camera_views: Mapping[int, CameraView] | None = None) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from bisect import insort
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,9 +43,10 @@ class MapGraph:
 
     poses: T_map_body (4, 4) by node id. gravity_factors: up direction over its sigma, where known
     (`share.mapping.graph.gravity`). reference_segments: for each segment the reference segment of its map.
-    maps: the segments of each map that have keyframes, in order of precedence, by reference segment. split_segments: segments that changed map because loops were removed; the reader clears it. log_scales:
-    log of the factor by which each agent's odometry is too long; covariance_scales: factor on its variances;
-    agents without an entry have 0 and 1.
+    maps: by reference segment, the segments with keyframes in order of precedence. split_segments: segments
+    that changed map because loops were removed; the reader clears it. log_scales: log of the factor by which
+    each agent's odometry is too long; covariance_scales: factor on its variances; agents without an entry
+    have 0 and 1.
     """
 
     def __init__(self) -> None:

@@ -266,8 +266,8 @@ class Mapper:
         return self.atlas.all_poses()
 
     def report(self) -> dict[str, Any]:
-        """Return the mapper's fields of edge.json, and under `agents` those of the runs that it lists. Of maps
-        it lists those in which these are, and the largest others; the rest are counted."""
+        """Return the mapper's fields of edge.json, and under `agents` those of the runs that it lists. The maps
+        that it lists are theirs, and the largest others."""
         atlas, runs = self.atlas, self.atlas.runs.listed(self._config.edge.max_agents)
         standings, sizes = atlas.quarantine.agreement.standings(runs), atlas.map_sizes()
         agents = {
@@ -279,10 +279,10 @@ class Mapper:
             }
             for agent in runs
         }
-        shown = {one["map_id"] for one in agents.values()}.union(
+        listed = {one["map_id"] for one in agents.values()}.union(
             nlargest(_MAX_MAPS, sizes, sizes.__getitem__)
         )
-        maps = {map_id: size for map_id, size in sizes.items() if map_id in shown}
+        maps = {map_id: size for map_id, size in sizes.items() if map_id in listed}
         return {
             "agents": agents,
             "maps": maps,
