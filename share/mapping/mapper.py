@@ -266,8 +266,8 @@ class Mapper:
         return self.atlas.all_poses()
 
     def report(self) -> dict[str, Any]:
-        """Return the mapper's fields of edge.json, and under `agents` those of the runs that it lists. The maps
-        that it lists are theirs, and the largest others."""
+        """Return the mapper's fields of edge.json, and under `agents` those of the runs that it lists. Listed
+        maps are theirs and the largest others."""
         atlas, runs = self.atlas, self.atlas.runs.listed(self._config.edge.max_agents)
         standings, sizes = atlas.quarantine.agreement.standings(runs), atlas.map_sizes()
         agents = {
@@ -279,9 +279,8 @@ class Mapper:
             }
             for agent in runs
         }
-        listed = {one["map_id"] for one in agents.values()}.union(
-            nlargest(_MAX_MAPS, sizes, sizes.__getitem__)
-        )
+        listed = {*nlargest(_MAX_MAPS, sizes, sizes.__getitem__)}
+        listed.update(one["map_id"] for one in agents.values())
         maps = {map_id: size for map_id, size in sizes.items() if map_id in listed}
         return {
             "agents": agents,

@@ -14,8 +14,8 @@ from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
 from share.wire.messages import Hello, PoseUpdate, public_tag
 
-# Limits on new runs, each at once and a second: each run stays in the map once it has a keyframe. One name: as
-# many as a person starts while trying things out; one key: a full room; the edge: two.
+# Limits on new runs, each at once and a second: each run stays in the map once it has a keyframe. One name:
+# as many as a person starts while trying things out; one key: a full room; the edge: two.
 _NAME_LIMIT, _CREDENTIAL_LIMIT, _EDGE_LIMIT = (8.0, 0.1), (32.0, 0.25), (128.0, 2.0)
 _SILENT_S = 0.6  # an agent pings every 0.5 s
 NAME_HOLD_S = 3.0  # a name stays in use for this long after its agent's last message

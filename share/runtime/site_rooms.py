@@ -25,7 +25,6 @@ from share.runtime.edge_observer import EdgeObserver
 from share.runtime.fault_guard import FaultGuard
 from share.runtime.output_writer import JobThread
 from share.runtime.served_room import RoomHost, ServedRoom
-from share.site.building import RoomMap
 from share.site.directory import PlaceDirectory, RoomRanking
 from share.site.report import site_report
 from share.site.room_switch import RoomPort, RoomSwitch
@@ -115,9 +114,7 @@ class SiteRooms:
         self._switch.move_waiting(time.monotonic_ns())
         if time.monotonic() >= self._maps_due_s:
             self._maps_due_s = time.monotonic() + _MAPS_S
-            self._switch.building.keep(
-                {RoomMap(name, one) for name, room in self._rooms.items() for one in room.maps()}
-            )
+            self._switch.building.keep(lambda one: self._rooms[one.room].may_have_map(one.map_id))
 
     def stop(self) -> None:
         """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
