@@ -76,7 +76,11 @@ class Atlas:
 
     def map_sizes(self) -> dict[str, int]:
         """Number of keyframes of each map, by its name."""
-        return {self.graph.map_id(reference): self.graph.map_size(reference) for reference in self.graph.maps}
+        segments = self.graph.odometry.segments
+        return {
+            segments[reference].name: sum([len(segments[s].nodes) for s in own])
+            for reference, own in self.graph.maps.items()
+        }
 
     def T_map_odom(self, agent: str) -> F64 | None:
         """T_map_odom (4, 4) at the agent's newest keyframe; None if its current segment has none."""

@@ -21,7 +21,7 @@ from share.mapping.graph_edges import GraphEdges
 from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.pose_table import PoseTable
 from share.mapping.segments import OdometrySegments
-from share.types import F64, Keyframe
+from share.types import F64, I64, Keyframe
 
 # Factor on the covariance of odometry over several keyframes: it shares its measurements with the steps
 # between.
@@ -263,6 +263,15 @@ class MapGraph:
 
     def map_nodes(self, reference_segment: int) -> list[int]:
         return [n for s in self.map_segments(reference_segment) for n in self.odometry.segments[s].nodes]
+
+    def near(self, node_id: int, max_m: float) -> tuple[I64, F64]:
+        """Nodes (N,) of a node's map whose positions are nearer than `max_m` to its own, and their poses
+        (N, 4, 4). At the origin there are nodes of all maps."""
+        nodes = self.odometry.nodes
+        own = set(self.map_segments(self.reference_segments[nodes[node_id].segment]))
+        node_ids, poses = self.poses.near(self.poses[node_id], max_m)
+        is_own = np.array([nodes[n].segment in own for n in node_ids.tolist()], bool)
+        return node_ids[is_own], poses[is_own]
 
     def anchor(self, reference_segment: int) -> int:
         """Node that fixes the gauge of a map."""

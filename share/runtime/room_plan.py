@@ -102,13 +102,13 @@ class RoomPlan(EdgeObserver):
 
     def __init__(self) -> None:
         self._runs: dict[str, _Run] = {}
-        self._drawn: dict[str, _Run] = {}  # by name, the one whose keyframe came last is last
+        self._drawn: dict[str, str] = {}  # runs by name, the one whose keyframe came last is last
         self._calls = 0
 
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         kept = {run.key: self._runs[run.key] for run in known if run.key in self._runs}
         self._runs = {run.key: kept.get(run.key) or _run_of(run.hello) for run in known}
-        self._drawn = {name: run for name, run in self._drawn.items() if run in kept.values()}
+        self._drawn = {name: key for name, key in self._drawn.items() if key in kept}
 
     def add_effect(self, effect: EdgeEffect) -> None:
         match effect:
@@ -118,14 +118,14 @@ class RoomPlan(EdgeObserver):
             case AddKeyframe() if (run := self._runs.get(effect.key)) is not None:
                 keyframe = effect.keyframe
                 run.add_keyframe(keyframe.id, keyframe.T_odom_body, keyframe.reference < 0)
-                self._draw(run)
+                self._draw(run.name, effect.key)
             case DropRun() if (gone := self._runs.pop(effect.key, None)) is not None:
-                if self._drawn.get(gone.name) is gone:
+                if self._drawn.get(gone.name) == effect.key:
                     del self._drawn[gone.name]
 
-    def _draw(self, run: _Run) -> None:
-        self._drawn.pop(run.name, None)
-        self._drawn[run.name] = run
+    def _draw(self, name: str, key: str) -> None:
+        self._drawn.pop(name, None)
+        self._drawn[name] = key
         if len(self._drawn) > _MAX_AGENTS:
             del self._drawn[next(iter(self._drawn))]
 
@@ -147,7 +147,8 @@ class RoomPlan(EdgeObserver):
     def report(self) -> dict[str, Any]:
         """Return `/plan.json`: of each agent's newest run, by name, the parts of its path by map, and where
         it is. Runs without a place are left out."""
-        reports = {name: run.report() for name, run in list(self._drawn.items())}
+        drawn = [self._runs.get(key) for key in list(self._drawn.values())]
+        reports = {run.name: run.report() for run in drawn if run is not None}
         return {"agents": {name: report for name, report in reports.items() if report["parts"]}}
 
 

@@ -87,7 +87,7 @@ def test_a_report_counts_keyframes_of_each_map_and_looks_no_further(names: int) 
         mapper = restored(count, min(names, count))
         return work_of(mapper.report)
 
-    assert work(MANY) - work(FEW) < 120 * (MANY - FEW)
+    assert work(MANY) - work(FEW) < 80 * (MANY - FEW)
 
 
 def test_a_map_of_many_runs_is_restored_in_time_that_grows_with_them() -> None:
