@@ -90,13 +90,13 @@ class AgentAgreement:
 
     def add_step(self, run: str, node_id: int, previous_id: int | None, T_ref_body: F64, cov: F64) -> bool:
         """Add a node, by odometry from the previous one; None: it begins a segment. Return whether scales may
-        have changed, or those of the run are new."""
+        have changed."""
         previous = None if previous_id is None else self._accumulated.get(previous_id)
         self._accumulated[node_id] = (
             AccumulatedOdometry.origin() if previous is None else previous.with_step(T_ref_body, cov)
         )
         if previous_id is None:
-            return True
+            return False
         return self.covariance_scales.add_step(self.identities.identity(run), T_ref_body, cov)
 
     def log_scale(self, run: str) -> float:

@@ -57,8 +57,11 @@ class Quarantine:
         """Add a node, by odometry from the previous one of its segment."""
         odometry = self._graph.odometry
         agent, previous = odometry.nodes[node_id].key.agent, odometry.previous_node(node_id)
-        if self.agreement.add_step(agent, node_id, previous, T_ref_body, cov):
-            self.apply_scales() if previous is not None else self._apply_scales_to([agent])
+        may_have_changed = self.agreement.add_step(agent, node_id, previous, T_ref_body, cov)
+        if previous is None:  # the run may be new
+            self._apply_scales_to([agent])
+        elif may_have_changed:
+            self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
         """Compare the agents of a verified loop, and split maps of agents that no longer agree. Decide again
@@ -166,8 +169,8 @@ class Quarantine:
         are_separated, loops = self.agreement.are_separated, graph.edges.loops
         loops_between = [n for n, loop in loops.items() if are_separated(loop.a.agent, loop.b.agent)]
         dropped = graph.drop_loops(loops_between) if loops_between else ()
-        pairs = [pair for own in graph.maps.values() for pair in itertools.combinations(sorted(own), 2)]
-        for a, b in pairs:
+        maps = list(graph.maps.values())
+        for a, b in itertools.chain.from_iterable(itertools.combinations(sorted(own), 2) for own in maps):
             if graph.reference_segments[a] == graph.reference_segments[b] and are_separated(
                 segments[a].agent, segments[b].agent
             ):
