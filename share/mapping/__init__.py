@@ -16,10 +16,10 @@ that of a map that has changed:
     localisation_gate    is an agent's place known well enough to publish a correction?
     corrections          which agents get one
 
-`atlas.Atlas` holds all of it, each keyframe's pose in `pose_table`, who is present in `agent_runs`. Slow work is yielded as `steps`, which
-the caller runs; what is decided and stored goes into `mapper_log`, as `map_changes`. Keyframes leave by
-`culling` (`redundancy`), `forgetting`, and `map_renewal` (`missing_points`); `keyframe_removal` mends the
-graph.
+`atlas.Atlas` holds all of it, each keyframe's pose in `pose_table`, who is present in `agent_runs`. Slow
+work is yielded as `steps`, which the caller runs; what is decided and stored goes into `mapper_log`, as
+`map_changes`. Keyframes leave by `culling` (`redundancy`), `forgetting`, and `map_renewal`
+(`missing_points`); `keyframe_removal` mends the graph.
 
 To change:
 

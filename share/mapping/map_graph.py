@@ -267,9 +267,11 @@ class MapGraph:
     def near(self, node_id: int, max_m: float) -> tuple[I64, F64]:
         """Nodes (N,) of a node's map whose positions are nearer than `max_m` to its own, and their poses
         (N, 4, 4). At the origin there are nodes of all maps."""
+        node_ids, poses = self.poses.near(self.poses[node_id], max_m)
+        if len(self.maps) == 1:
+            return node_ids, poses
         nodes = self.odometry.nodes
         own = set(self.map_segments(self.reference_segments[nodes[node_id].segment]))
-        node_ids, poses = self.poses.near(self.poses[node_id], max_m)
         is_own = np.array([nodes[n].segment in own for n in node_ids.tolist()], bool)
         return node_ids[is_own], poses[is_own]
 
