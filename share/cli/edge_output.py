@@ -79,8 +79,10 @@ def print_event(stderr: Stderr, verbose: bool, event: dict[str, Any]) -> None:
 
 
 def run_summary(report: dict[str, Any]) -> str:
-    """Return a line for each agent, and one about loops."""
+    """Return a line for each agent that the report lists, and one about loops."""
     lines = [_agent_summary(name, agent) for name, agent in report["agents"].items()]
+    if unlisted := report["unlisted_runs"]:
+        lines.append(f"and {unlisted} earlier runs")
     if loops := report.get("loops"):  # absent until the mapper has reported
         done = report["merges"]["done"]
         lines.append(f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {done} merges")

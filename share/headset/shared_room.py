@@ -5,7 +5,6 @@ It uses no clock, socket or file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from share.headset.frame_times import BodyMotion, LeastDelay, MotionEstimate
 from share.headset.page_messages import MAX_POINTS, numbers, pose_fields
+from share.mapping.agent_runs import AgentRuns
 from share.protocol.known_maps import KnownMaps
 from share.types import F32, F64, Correction
 from share.view import events as ev
@@ -117,9 +117,10 @@ class SharedRoom:
         self._begin()
 
     def _begin(self) -> None:
-        self._runs: dict[str, _RoomAgent] = {}  # by run key, the newest of a name last
+        self._runs: dict[str, _RoomAgent] = {}  # by run key
+        self._presence = AgentRuns()  # present: those that are there
         self._maps = KnownMaps()
-        self._changed: set[str] = set()  # run keys
+        self._changed: dict[str, None] = {}  # run keys
         self._moves: list[AgentMoved] = []
 
     def apply(self, event: ev.RoomEvent) -> None:
@@ -129,11 +130,13 @@ class SharedRoom:
             case ev.RunArrived():
                 if event.run not in self._runs:
                     self._runs[event.run] = _RoomAgent(RunPath(len(self._runs), event))
+                    self._presence.add(event.run, event.name)
+                    self._presence.set_present(event.run, False)
             case ev.KeyframeArrived():
                 self._add_keyframe(event)
             case ev.PoseArrived() if (run := self._runs.get(event.run)) is not None:
                 run.add_pose(event)
-                self._changed.add(event.run)
+                self._mark_changed(event.run, run)
             case ev.CorrectionArrived() if (run := self._runs.get(event.run)) is not None:
                 self._correct(run, event)
             case ev.MapsSolved():
@@ -144,6 +147,8 @@ class SharedRoom:
                         run.path.remove_keyframe(key.id)
             case ev.RunRemoved():
                 self._runs.pop(event.run, None)
+                self._changed.pop(event.run, None)
+                self._presence.remove(event.run)
                 self._maps.forget(event.run)
             case ev.AgentsReported():
                 self._report(event)
@@ -159,7 +164,7 @@ class SharedRoom:
 
     def _correct(self, run: _RoomAgent, event: ev.CorrectionArrived) -> None:
         run.path.correct(event.map_id, event.T_map_odom, event.segment_keyframe)
-        self._changed.add(event.run)
+        self._mark_changed(event.run, run)
         correction = Correction(event.T_map_odom, _NO_COV, event.map_id, 0, event.segment_keyframe)
         if (move := self._maps.add_correction(event.run, correction)) is not None:
             self._moves.append(AgentMoved(run.name, move.old, move.new, move.T_new_old))
@@ -171,7 +176,7 @@ class SharedRoom:
             run = self._runs.get(key.agent)
             if run is not None and (one := run.path.keyframes.get(key.id)) is not None:
                 one.place(map_id, T, True)
-                self._changed.add(key.agent)
+                self._mark_changed(key.agent, run)
 
     def _report(self, event: ev.AgentsReported) -> None:
         for entry in event.agents.values():
@@ -181,34 +186,37 @@ class SharedRoom:
             state = GONE if entry["gone"] else "SILENT" if entry["state"] == "SILENT" else ""
             if state != run.state:
                 run.state = state
-                self._changed.add(entry["run"])
+                self._mark_changed(entry["run"], run)
+
+    def _mark_changed(self, key: str, run: _RoomAgent) -> None:
+        self._changed[key] = None
+        if run.is_there != (key in self._presence.present()):
+            self._presence.set_present(key, run.is_there)
 
     # ------------------------------------------------------------------ what pages are told
 
     def agents(self) -> list[dict[str, str]]:
         """Return name and kind of the agents that are there."""
-        shown = (run.path.shown for run in self._newest().values() if run.is_there)
-        return [{"name": one.name, "kind": str(one.kind)} for one in shown]
+        return [{"name": run.name, "kind": str(run.path.shown.kind)} for run in self._present()]
 
     def take_poses(self, has_paths: bool = False) -> list[dict[str, Any]]:
         """Return the newest pose of each agent that has another than at the last call."""
-        changed, self._changed = self._changed, set()
-        newest = self._newest().items()
-        return [run.fields(has_paths) for key, run in newest if key in changed and run.time_ns]
+        changed = [self._runs[key] for key in self._changed if self._presence.is_latest(key)]
+        self._changed = {}
+        return [run.fields(has_paths) for run in changed if run.time_ns]
 
     def poses(self) -> list[dict[str, Any]]:
         """Return the newest pose of every agent that is there, with its path."""
-        return [run.fields(True) for run in self._newest().values() if run.is_there]
+        return [run.fields(True) for run in self._present()]
 
     def take_moves(self) -> list[AgentMoved]:
         """Return how agents changed their map since the last call."""
         moves, self._moves = self._moves, []
         return moves
 
-    def _newest(self) -> Mapping[str, _RoomAgent]:
-        """Return the newest run of each agent, by run key."""
-        newest = {run.name: key for key, run in self._runs.items()}
-        return {key: self._runs[key] for key in newest.values()}
+    def _present(self) -> list[_RoomAgent]:
+        """Return the latest run of each agent that is there."""
+        return [self._runs[key] for key in self._presence.present() if self._presence.is_latest(key)]
 
     def points(self, map_id: str) -> F32:
         """Return points (N, 3) of a map, at most MAX_POINTS, spread over its keyframes."""

@@ -10,16 +10,16 @@ that of a map that has changed:
                          (`recognition.index`), verify (`recognition.verification`) and align them
     agents               do the agents agree on scale and covariances? else quarantine
     loop_acceptance      is a loop accepted: alone, or with others (`loop_consistency`, `overlap_check`)
-    map_graph            nodes, edges, and which segments (`segments`) form one map
+    map_graph            nodes, edges (`graph_edges`), and which segments (`segments`) form one map
     map_solving          the job of the solver (`graph`), and what its solution changes
     map_gauge            how that is published: without motions of the whole map that are uncertain
     localisation_gate    is an agent's place known well enough to publish a correction?
     corrections          which agents get one
 
-`atlas.Atlas` holds all of it, each keyframe's pose in `pose_table`. Slow work is yielded as `steps`, which
-the caller runs; what is decided and stored goes into `mapper_log`, as `map_changes`. Keyframes leave by
-`culling` (`redundancy`), `forgetting`, and `map_renewal` (`missing_points`); `keyframe_removal` mends the
-graph.
+`atlas.Atlas` holds all of it, each keyframe's pose in `pose_table`, who is present in `agent_runs`. Slow
+work is yielded as `steps`, which the caller runs; what is decided and stored goes into `mapper_log`, as
+`map_changes`. Keyframes leave by `culling` (`redundancy`), `forgetting`, and `map_renewal`
+(`missing_points`); `keyframe_removal` mends the graph.
 
 To change:
 

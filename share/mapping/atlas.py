@@ -5,11 +5,11 @@ Plain sequential calls, without clock or thread.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from share.config import MergeConfig
+from share.mapping.agent_runs import AgentRuns
 from share.mapping.agents.quarantine import Quarantine
 from share.mapping.culling import KeyframeCulling
 from share.mapping.graph.edges import inflate_covariance
@@ -29,16 +29,15 @@ from share.mapping.map_renewal import MapRenewal
 from share.mapping.map_solving import MapSolving
 from share.mapping.overlap_check import OverlapCheck
 from share.mapping.recognition.verification import CameraView
-from share.mapping.segments import AgentRuns
 from share.types import F64, Keyframe
 
 
 class Atlas:
     """All keyframes of all agents, in maps. Keyframes are numbered by node ids.
 
-    graph: poses, edges and maps. quarantine: agents that are kept apart. loop_acceptance: loops between two
-    maps and within one. solving: jobs of the solver and their solutions. culling: keyframes to remove.
-    renewal: keyframes of earlier sessions that show what is gone.
+    graph: poses, edges and maps. runs: who is present. quarantine: agents that are kept apart.
+    loop_acceptance: loops between two maps and within one. solving: jobs of the solver and their solutions.
+    culling: keyframes to remove. renewal: keyframes of earlier sessions that show what is gone.
     """
 
     def __init__(self, config: MergeConfig, camera_views: Mapping[int, CameraView] | None = None) -> None:
@@ -49,9 +48,9 @@ class Atlas:
         self.loop_acceptance = LoopAcceptance(config, self.graph, self.overlap_check)
         self.renewal = MapRenewal(self.graph, known_views, self.overlap_check)
         self._localisation_gate = LocalisationGate(config.enter_m)
-        self._runs = AgentRuns()
-        self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self._runs)
-        self.culling = KeyframeCulling(self.graph, self._runs)
+        self.runs = AgentRuns()
+        self.solving = MapSolving(self.graph, self.loop_acceptance, self._localisation_gate, self.runs)
+        self.culling = KeyframeCulling(self.graph, self.runs)
         self.quarantine = Quarantine(self.graph, self.loop_acceptance)
 
     def __len__(self) -> int:
@@ -76,10 +75,12 @@ class Atlas:
         return None if segment is None else self.graph.map_id(segment)
 
     def map_sizes(self) -> dict[str, int]:
-        out = Counter[str]()
-        for segment in sorted(self.graph.odometry.live_segments):
-            out[self.graph.map_id(segment)] += len(self.graph.odometry.segments[segment].nodes)
-        return out
+        """Number of keyframes of each map, by its name."""
+        segments = self.graph.odometry.segments
+        return {
+            segments[reference].name: sum([len(segments[s].nodes) for s in own])
+            for reference, own in self.graph.maps.items()
+        }
 
     def T_map_odom(self, agent: str) -> F64 | None:
         """T_map_odom (4, 4) at the agent's newest keyframe; None if its current segment has none."""
@@ -96,14 +97,9 @@ class Atlas:
 
     def waiting_segments(self) -> list[int]:
         """Segments of connected agents that wait to enter another's map."""
-        odometry = self.graph.odometry
-        return [
-            segment
-            for segment in odometry.live_segments
-            if odometry.current_segment(agent := odometry.segments[segment].agent) == segment
-            and not self._runs.is_absent(agent)
-            and not self.is_placed(odometry.segments[segment].nodes[-1])
-        ]
+        newest = map(self.graph.odometry.newest_node, self.runs.present())
+        nodes = self.graph.odometry.nodes
+        return sorted(nodes[n].segment for n in newest if n is not None and not self.is_placed(n))
 
     def all_poses(self) -> SavePoses:
         """Current pose and map of every keyframe."""
@@ -116,7 +112,7 @@ class Atlas:
 
     def add_run(self, agent: str, name: str, credential: str | None = "") -> None:
         """Register a run of the agent of this name. credential: see `AgentIdentities.set_credential`."""
-        self._runs.add(agent, name)
+        self.runs.add(agent, name)
         self.quarantine.agreement.add_run(agent, name, credential)
 
     def set_present(self, agent: str, is_present: bool) -> None:
@@ -125,16 +121,16 @@ class Atlas:
         An absent agent is sent nothing and delays nobody's corrections. When it returns, its map is solved if
         its pose there was not published.
         """
-        if self._runs.set_present(agent, is_present) and is_present:
+        if self.runs.set_present(agent, is_present) and is_present:
             self.solving.schedule_unpublished(agent)
 
     def is_run_gone(self, agent: str) -> bool:
         """Return whether the run is not connected and has no keyframes."""
-        return self._runs.is_absent(agent) and not self.graph.odometry.has_nodes(agent)
+        return self.runs.is_absent(agent) and not self.graph.odometry.has_nodes(agent)
 
     def remove_run(self, agent: str) -> None:
         """Forget a run without keyframes that will not return."""
-        self._runs.remove(agent)
+        self.runs.remove(agent)
         self.quarantine.remove_run(agent)
         self.solving.remove_run(agent)
         self.graph.odometry.remove_agent(agent)
@@ -169,6 +165,8 @@ class Atlas:
         equals the oldest, keeps its map's name and frame in a merge. Raises ValueError for a duplicate or an
         unknown reference.
         """
+        if agent not in self.runs:
+            self.runs.add(agent, agent)
         cov = inflate_covariance(keyframe.T_ref_body, keyframe.cov)
         node_id = self.graph.add_keyframe(agent, keyframe, cov, make_gravity_factor(keyframe), rank)
         self.quarantine.add_step(node_id, keyframe.T_ref_body, cov)

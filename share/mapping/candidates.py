@@ -77,11 +77,9 @@ def _by_map_poses(graph: MapGraph, node_id: int, own: Sequence[int]) -> tuple[se
 
 def larger_maps_first(graph: MapGraph, others: Sequence[int]) -> list[int]:
     """Sort candidates: those in larger maps first, so that agents end up in one map."""
-    nodes = graph.odometry.nodes
-    sizes: Counter[int] = Counter()
-    for segment, reference_segment in zip(graph.odometry.segments, graph.reference_segments, strict=True):
-        sizes[reference_segment] += len(segment.nodes)
-    return sorted(others, key=lambda n: -sizes[graph.reference_segments[nodes[n].segment]])
+    maps = {n: graph.reference_segments[graph.odometry.nodes[n].segment] for n in others}
+    sizes = {reference_segment: graph.map_size(reference_segment) for reference_segment in set(maps.values())}
+    return sorted(others, key=lambda n: -sizes[maps[n]])
 
 
 # ---- Keyframes near one by the map's poses
@@ -99,7 +97,7 @@ def nearby_candidates(graph: MapGraph, node_id: int, eligible: AbstractSet[int])
     per_segment = Counter[int]()
     for near_id in _nearest_first(graph, node_id):
         segment = graph.odometry.nodes[near_id].segment
-        if near_id in excluded or near_id not in eligible or not graph.is_same_map(node_id, near_id):
+        if near_id in excluded or near_id not in eligible:
             continue
         if per_segment[segment] < _MAX_PER_SEGMENT:
             per_segment[segment] += 1
@@ -110,10 +108,9 @@ def nearby_candidates(graph: MapGraph, node_id: int, eligible: AbstractSet[int])
 
 
 def _nearest_first(graph: MapGraph, node_id: int) -> list[int]:
-    """Return the nodes of all maps within the limits, those that see most of what this one sees first."""
-    T = graph.poses[node_id]
-    node_ids, poses = graph.poses.near(T, _NEAR_M)
-    (distance,), (angle,) = se3.pairwise_distances(T[None], poses)
+    """Return the nodes of its map within the limits, those that see most of what this one sees first."""
+    node_ids, poses = graph.near(node_id, _NEAR_M)
+    (distance,), (angle,) = se3.pairwise_distances(graph.poses[node_id][None], poses)
     cost = np.where(angle < _NEAR_RAD, distance / _NEAR_M + angle / _NEAR_RAD, np.inf)
     order = np.argsort(cost, kind="stable")[: np.isfinite(cost).sum()]
     return [int(n) for n in node_ids[order]]

@@ -18,10 +18,11 @@ from enum import Enum, auto
 
 import numpy as np
 
+from share.mapping.agent_runs import AgentRuns
 from share.mapping.loop_consistency import articulation_segments
 from share.mapping.map_graph import MapGraph
 from share.mapping.redundancy import InSlices, redundant, run_without_pause
-from share.mapping.segments import MIN_LOOP_GAP, AgentRuns
+from share.mapping.segments import MIN_LOOP_GAP
 
 _MARGIN = 1.05  # share of the most keyframes at which those to remove are chosen
 _REMOVED_PER_KEYFRAME = 2
@@ -107,8 +108,8 @@ class KeyframeCulling:
 
     def _choose_with(self, count: int, reserve: ReturnReserve) -> InSlices[list[int]]:
         maps = self._segments_by_map()
-        finished = [reference for reference in maps if self._is_finished(maps[reference], reserve)]
-        ongoing = [reference for reference in maps if reference not in set(finished)]
+        finished = dict.fromkeys(one for one in maps if self._is_finished(maps[one], reserve))
+        ongoing = [one for one in maps if one not in finished]
         protected = yield from self._protected(ongoing, reserve)
         quotas, out = self._quotas(count, protected), dict[int, None]()
         for reference in (*finished, *ongoing):

@@ -57,7 +57,7 @@ class KeyframeLookup:
             yield from self.index(entries)
         is_placed = self._atlas.is_placed(node_id)
         is_aligned = is_placed and (yield from self._align_nearby(node_id))
-        seeks_maps = len(self._atlas.map_sizes()) > 1 and not self._queries.has_backlog
+        seeks_maps = len(self._atlas.graph.maps) > 1 and not self._queries.has_backlog
         if is_aligned and not seeks_maps and node_id % _RECHECK_INTERVAL:
             return  # the map is right here; the keyframe is described when nothing waits
         yield from self.describe(node_id)
@@ -166,9 +166,8 @@ class KeyframeLookup:
         T_a_b = self._atlas.graph.relative_pose(candidate, node_id)
         objection = self._merge_gate.skip_reason(self._overlap_volume(a, b, T_a_b), same_map=True)
         if objection:
-            merges = self._counters.runs[b.agent].merges
-            merges["requested"] += 1
-            merges["skipped"] += 1
+            self._counters.count_merge(b.agent, "requested")
+            self._counters.count_merge(b.agent, "skipped")
             self._log.events.append(MapEvent(b.agent, "merge skipped", f"loop {a} - {b}: {objection}"))
         return bool(objection)
 
@@ -206,14 +205,13 @@ class KeyframeLookup:
     ) -> list[MapEvent]:
         """Decide on a verified candidate: count, compare the agents, check the loop and add it."""
         atlas, a, b = self._atlas, self._atlas.key(candidate), self._atlas.key(node_id)
-        counters = self._counters.runs[b.agent]
-        counters.loops_tried += 1
+        self._counters.count_tried(b.agent)
         if isinstance(outcome, Refusal):
             return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
         if search is not None and not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
             search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers, is_confirmed=outcome.is_confirmed)
-        counters.merges["requested"] += 1
+        self._counters.count_merge(b.agent, "requested")
         change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
         self._log.record_loops(change)
         events = [MapEvent(agent, *standing.event) for agent, standing in change.standings.items()]
@@ -224,7 +222,7 @@ class KeyframeLookup:
         reason = f"{decision.reason} ({outcome.reason})"
         if not decision.accepted:
             return [*events, MapEvent(b.agent, "loop not accepted", reason)]
-        counters.merges["done"] += 1
+        self._counters.count_merge(b.agent, "done")
         self._merge_gate.record_merge(self._overlap_volume(a, b, loop.T_a_b))
         undone = [MapEvent(b.agent, "merge undone", reason)] if decision.dropped else []
         if decision.joined_maps is None or decision.T_join is None:

@@ -8,120 +8,24 @@ Maps follow from the loops alone, so removing a loop undoes its merge.
 from __future__ import annotations
 
 import itertools
+from bisect import insort
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from share.geometry import se3
-from share.mapping.graph.covariance import CovariancePaths
 from share.mapping.graph.edges import PoseEdge, inflate_span
-from share.mapping.graph.solver import GraphUpdate
+from share.mapping.graph_edges import GraphEdges
 from share.mapping.loops import KeyframeKey, Loop, RelativePose
 from share.mapping.pose_table import PoseTable
 from share.mapping.segments import OdometrySegments
-from share.types import F64, Keyframe
+from share.types import F64, I64, Keyframe
 
 # Factor on the covariance of odometry over several keyframes: it shares its measurements with the steps
 # between.
 _SHARED_INFORMATION = 2.0
-
-
-class GraphEdges:
-    """Odometry and loop edges between node ids, and what of them the solver has not received yet."""
-
-    def __init__(self) -> None:
-        self.covariance_paths = CovariancePaths()
-        self.by_id: dict[int, PoseEdge] = {}
-        self.loops: dict[int, Loop] = {}  # by edge id, oldest first
-        self.spans: set[int] = set()  # edge ids of odometry over several keyframes
-        self._incident: dict[int, set[int]] = {}
-        self._next_id = 0
-        self.is_reset = True  # the next update contains the whole graph
-        self._sent_nodes: set[int] = set()  # nodes that the solver has
-        # Not sent to the solver yet:
-        self._pending_edges: set[int] = set()
-        self._moved_nodes: set[int] = set()  # new or moved
-        self._removed_edges: set[int] = set()
-        self._removed_nodes: set[int] = set()
-
-    def add(self, edge: PoseEdge, loop: Loop | None = None) -> int:
-        """Add an edge and return its id. With a loop, the solver treats it as a possible outlier."""
-        edge_id, self._next_id = self._next_id, self._next_id + 1
-        self.by_id[edge_id] = edge
-        self._pending_edges.add(edge_id)
-        if loop is not None:
-            self.loops[edge_id] = loop
-        for end in (edge.a, edge.b):
-            self._incident.setdefault(end, set()).add(edge_id)
-        self.covariance_paths.add(edge)
-        return edge_id
-
-    def add_span(self, edge: PoseEdge) -> None:
-        """Add an odometry edge over several keyframes, beside those between neighbours."""
-        self.spans.add(self.add(edge))
-
-    def remove(self, edge_id: int) -> None:
-        """Remove an edge, and its loop if it has one."""
-        edge = self.by_id.pop(edge_id)
-        self.spans.discard(edge_id)
-        self.loops.pop(edge_id, None)
-        for end in (edge.a, edge.b):
-            self._incident[end].discard(edge_id)
-        self.covariance_paths.remove(edge)
-        if edge_id in self._pending_edges:
-            self._pending_edges.discard(edge_id)
-        else:
-            self._removed_edges.add(edge_id)
-
-    def incident(self, node_id: int) -> list[int]:
-        """Ids of the edges that end at a node, oldest first."""
-        return sorted(self._incident.get(node_id, ()))
-
-    def degree(self, node_id: int) -> int:
-        """Number of edges that end at a node."""
-        return len(self._incident.get(node_id, ()))
-
-    def mark_moved(self, node_ids: Iterable[int]) -> None:
-        """Mark nodes whose poses differ from the solver's."""
-        self._moved_nodes.update(node_ids)
-
-    def remove_node(self, node_id: int) -> None:
-        """Remove a node that has no edges."""
-        self._incident.pop(node_id, None)
-        self._moved_nodes.discard(node_id)
-        if node_id in self._sent_nodes:
-            self._sent_nodes.discard(node_id)
-            self._removed_nodes.add(node_id)
-
-    def take_update(self, poses: PoseTable, gravity_factors: Mapping[int, F64]) -> GraphUpdate:
-        """Return all changes since the last call and count them as sent.
-
-        poses, gravity_factors: of all node ids (`share.mapping.graph.gravity`).
-        """
-        edges = [(n, self.by_id[n], n in self.loops or n in self.spans) for n in sorted(self._pending_edges)]
-        moved = sorted(self._moved_nodes)
-        update = GraphUpdate.from_edges(
-            dict(zip(moved, poses.stack(moved), strict=True)),
-            edges,
-            sorted(self._removed_edges),
-            sorted(self._removed_nodes),
-            gravity_factors,
-        )
-        self.is_reset = False
-        self._sent_nodes |= self._moved_nodes
-        for sent in (self._pending_edges, self._moved_nodes, self._removed_edges, self._removed_nodes):
-            sent.clear()
-        return update
-
-    def reset(self) -> None:
-        """Count everything as not sent: the solver lost its state."""
-        self.is_reset = True
-        self._pending_edges = set(self.by_id)
-        self._moved_nodes |= self._sent_nodes
-        for forgotten in (self._sent_nodes, self._removed_edges, self._removed_nodes):
-            forgotten.clear()
 
 
 def _rescaled(edge: PoseEdge, log_change: float, covariance_ratio: float) -> PoseEdge:
@@ -139,9 +43,10 @@ class MapGraph:
 
     poses: T_map_body (4, 4) by node id. gravity_factors: up direction over its sigma, where known
     (`share.mapping.graph.gravity`). reference_segments: for each segment the reference segment of its map.
-    split_segments: segments that changed map because loops were removed; the reader clears it. log_scales:
-    log of the factor by which each agent's odometry is too long; covariance_scales: factor on its variances;
-    agents without an entry have 0 and 1.
+    maps: by reference segment, the segments with keyframes in order of precedence. split_segments: segments
+    that changed map because loops were removed; the reader clears it. log_scales: log of the factor by which
+    each agent's odometry is too long; covariance_scales: factor on its variances; agents without an entry
+    have 0 and 1.
     """
 
     def __init__(self) -> None:
@@ -150,11 +55,13 @@ class MapGraph:
         self.poses = PoseTable()
         self.gravity_factors: dict[int, F64] = {}
         self.reference_segments: list[int] = []
+        self.maps: dict[int, list[int]] = {}
         self.split_segments: set[int] = set()
         self.loop_counts: Counter[tuple[int, int]] = Counter()  # by pair of segments, the older first
         self.log_scales: dict[str, float] = {}
         self.covariance_scales: dict[str, float] = {}
         self.unsolved_maps: dict[int, None] = {}  # reference segments, longest unsolved first
+        self._joins_changed = False  # `loop_counts` has other pairs than at the last `update_maps`
 
     def add_keyframe(
         self, agent: str, keyframe: Keyframe, cov: F64, gravity_factor: F64, rank: int = 0
@@ -173,6 +80,8 @@ class MapGraph:
         agent = self.odometry.segments[node.segment].agent
         T_ref_body = rescale_translation(T_ref_body, self.log_scales.get(agent, 0.0))
         self.reference_segments += range(len(self.reference_segments), len(self.odometry.segments))
+        if len(self.odometry.segments[node.segment].nodes) == 1:
+            self._add_to_map(node.segment)
         if previous is None:
             self.poses[node_id] = node.T_odom_body
         else:
@@ -203,8 +112,11 @@ class MapGraph:
 
     def remove_node(self, node_id: int) -> None:
         """Remove a node that has no edges."""
+        segment = self.odometry.nodes[node_id].segment
         self.edges.remove_node(node_id)
         self.odometry.remove_node(node_id)
+        if not self.odometry.segments[segment].nodes:
+            self._remove_from_map(segment)
         del self.poses[node_id]
         self.gravity_factors.pop(node_id, None)
 
@@ -223,7 +135,9 @@ class MapGraph:
     def add_loop_edge(self, edge: PoseEdge, loop: Loop) -> None:
         """Add a loop as an edge. Call `update_maps` afterwards if it connects two maps."""
         self.edges.add(edge, loop)
-        self.loop_counts[self.segment_pair(edge)] += 1
+        pair = self.segment_pair(edge)
+        self._joins_changed |= pair not in self.loop_counts
+        self.loop_counts[pair] += 1
 
     def remove_loop_edge(self, edge_id: int) -> None:
         """Remove a loop's edge. Call `update_maps` afterwards if it was the last between its segments."""
@@ -231,6 +145,7 @@ class MapGraph:
         self.loop_counts[pair] -= 1
         if not self.loop_counts[pair]:
             del self.loop_counts[pair]
+            self._joins_changed = True
         self.edges.remove(edge_id)
 
     def drop_loops(self, edge_ids: Sequence[int]) -> tuple[Loop, ...]:
@@ -271,15 +186,14 @@ class MapGraph:
         log_change = log_scale - self.log_scales.get(agent, 0.0)
         covariance_ratio = covariance_scale / self.covariance_scales.get(agent, 1.0)
         self.log_scales[agent], self.covariance_scales[agent] = log_scale, covariance_scale
-        for segment_index, segment in enumerate(self.odometry.segments):
-            if segment.agent != agent or not segment.nodes:
-                continue
+        for segment_index in self.odometry.live_segments_of(agent):
+            segment = self.odometry.segments[segment_index]
             for before, after in itertools.pairwise(segment.nodes):
                 edge_id, edge = self._find_odometry_edge(before, after)
                 self.edges.remove(edge_id)
                 self.edges.add(_rescaled(edge, log_change, covariance_ratio))
-            ends = set(segment.nodes)
-            for edge_id in sorted(n for n in self.edges.spans if self.edges.by_id[n].a in ends):
+            incident = {edge_id for n in segment.nodes for edge_id in self.edges.incident(n)}
+            for edge_id in sorted(incident & self.edges.spans):
                 edge = self.edges.by_id[edge_id]
                 self.edges.remove(edge_id)
                 self.edges.add_span(_rescaled(edge, log_change, covariance_ratio))
@@ -330,10 +244,9 @@ class MapGraph:
 
     def find_map(self, map_id: str) -> int:
         """Reference segment of the map of this name. Raises ValueError if there is none."""
-        for reference_segment in {self.reference_segments[s] for s in self.odometry.live_segments}:
-            if self.odometry.segments[reference_segment].name == map_id:
-                return reference_segment
-        raise ValueError(f"there is no map {map_id}")
+        if (reference_segment := self.odometry.by_name.get(map_id)) not in self.maps:
+            raise ValueError(f"there is no map {map_id}")
+        return reference_segment
 
     def rank(self, segment: int) -> tuple[int, int]:
         """Order of precedence: the segment with the least value is the reference of its map."""
@@ -341,13 +254,26 @@ class MapGraph:
 
     def map_segments(self, reference_segment: int) -> list[int]:
         """Segments of a map that have keyframes, in order of precedence."""
-        return sorted(
-            (s for s in self.odometry.live_segments if self.reference_segments[s] == reference_segment),
-            key=self.rank,
-        )
+        return list(self.maps.get(reference_segment, ()))
+
+    def map_size(self, reference_segment: int) -> int:
+        """Number of keyframes of a map."""
+        segments = self.odometry.segments
+        return sum(len(segments[s].nodes) for s in self.maps.get(reference_segment, ()))
 
     def map_nodes(self, reference_segment: int) -> list[int]:
         return [n for s in self.map_segments(reference_segment) for n in self.odometry.segments[s].nodes]
+
+    def near(self, node_id: int, max_m: float) -> tuple[I64, F64]:
+        """Nodes (N,) of a node's map whose positions are nearer than `max_m` to its own, and their poses
+        (N, 4, 4). At the origin there are nodes of all maps."""
+        node_ids, poses = self.poses.near(self.poses[node_id], max_m)
+        if len(self.maps) == 1:
+            return node_ids, poses
+        nodes = self.odometry.nodes
+        own = set(self.map_segments(self.reference_segments[nodes[node_id].segment]))
+        is_own = np.array([nodes[n].segment in own for n in node_ids.tolist()], bool)
+        return node_ids[is_own], poses[is_own]
 
     def anchor(self, reference_segment: int) -> int:
         """Node that fixes the gauge of a map."""
@@ -380,7 +306,11 @@ class MapGraph:
         return (a, b) if a < b else (b, a)
 
     def update_maps(self) -> None:
-        """Recompute the reference segment of every segment: the connected components of the loops."""
+        """Recompute the reference segment of every segment: the connected components of the loops. Costs
+        nothing while the same segments are connected."""
+        if not self._joins_changed:
+            return
+        self._joins_changed = False
         root = list(range(len(self.reference_segments)))
 
         def find(i: int) -> int:
@@ -392,3 +322,15 @@ class MapGraph:
             low, high = sorted(map(find, pair), key=self.rank)
             root[high] = low
         self.reference_segments = [find(i) for i in range(len(root))]
+        self.maps = {}
+        for segment in sorted(self.odometry.live_segments):
+            self._add_to_map(segment)
+
+    def _add_to_map(self, segment: int) -> None:
+        insort(self.maps.setdefault(self.reference_segments[segment], []), segment, key=self.rank)
+
+    def _remove_from_map(self, segment: int) -> None:
+        segments = self.maps[self.reference_segments[segment]]
+        segments.remove(segment)
+        if not segments:
+            del self.maps[self.reference_segments[segment]]

@@ -72,16 +72,11 @@ class MapRenewal:
         graph, is_earlier = self._graph, self._overlap_check.is_earlier
         if is_earlier(node_id) or self._overlap_check.is_on_probation(graph.odometry.nodes[node_id].segment):
             return []
-        T = graph.poses[node_id]
-        near_ids, poses = graph.poses.near(T, PLACE_M)
-        near = [
-            i
-            for i, n in enumerate(near_ids.tolist())
-            if is_earlier(n) and n in self._camera_views and graph.is_same_map(n, node_id)
-        ]
+        near_ids, poses = graph.near(node_id, PLACE_M)
+        near = [i for i, n in enumerate(near_ids.tolist()) if is_earlier(n) and n in self._camera_views]
         if not near:
             return []
-        (distance,), (angle,) = se3.pairwise_distances(T[None], poses[near])
+        (distance,), (angle,) = se3.pairwise_distances(graph.poses[node_id][None], poses[near])
         unlike = distance / PLACE_M + angle / PLACE_RAD  # as in `share.mapping.redundancy`
         nearest = np.argsort(unlike, kind="stable")[:_MAX_COMPARED]
         return [int(near_ids[near[i]]) for i in nearest if unlike[i] < 1]

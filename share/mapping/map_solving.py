@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from share.geometry import se3
+from share.mapping.agent_runs import AgentRuns
 from share.mapping.graph.solver import GraphSolution, GraphUpdate
 from share.mapping.localisation_gate import LocalisationGate, PlacementUncertainty, sigma_ahead
 from share.mapping.loop_acceptance import LoopAcceptance, pending_text
 from share.mapping.loops import KeyframeKey, Loop
 from share.mapping.map_gauge import MapGauge, SolvedPose
 from share.mapping.map_graph import MapGraph
-from share.mapping.segments import AgentRuns
 from share.types import F64, Correction
 
 _OUTLIER_CHI2 = 1000.0  # loops with a larger chi-squared after a solution are dropped

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from heapq import nlargest
 from typing import Any, cast
 
 from share.config import Config
@@ -28,6 +29,8 @@ from share.mapping.segments import restored_ranks, segment_rank
 from share.mapping.steps import Job, LookupStep, SolveStep, Step, StepRunner
 from share.types import Keyframe
 from share.wire.messages import Hello
+
+_MAX_MAPS = 64  # in a report, beside those of the runs that it lists
 
 
 class Mapper:
@@ -184,7 +187,7 @@ class Mapper:
 
     def _next_query(self) -> int | None:
         node_id = self.queries.next_query()
-        if node_id is None and len(self.atlas.map_sizes()) > 1:
+        if node_id is None and len(self.atlas.graph.maps) > 1:
             node_id = self.queries.next_skipped()  # too late for an answer, but it may merge maps
         return node_id
 
@@ -263,19 +266,27 @@ class Mapper:
         return self.atlas.all_poses()
 
     def report(self) -> dict[str, Any]:
-        """Return the mapper's fields of edge.json, and under `agents` those of each run."""
-        atlas = self.atlas
+        """Return the mapper's fields of edge.json, and under `agents` those of the runs that it lists. Listed
+        maps are theirs and the largest others."""
+        atlas, runs = self.atlas, self.atlas.runs.listed(self._config.edge.max_agents)
+        standings, sizes = atlas.quarantine.agreement.standings(runs), atlas.map_sizes()
+        agents = {
+            agent: {
+                **self._counters.runs[agent].report(),
+                "queries_skipped": self.queries.skipped[agent],
+                "map_id": atlas.current_map_id(agent),
+                "consistency": asdict(standings[agent]),
+            }
+            for agent in runs
+        }
+        listed = {*nlargest(_MAX_MAPS, sizes, sizes.__getitem__)}
+        listed.update(one["map_id"] for one in agents.values())
+        maps = {map_id: size for map_id, size in sizes.items() if map_id in listed}
         return {
-            "agents": {
-                agent: {
-                    **own.report(),
-                    "queries_skipped": self.queries.skipped[agent],
-                    "map_id": atlas.current_map_id(agent),
-                    "consistency": asdict(atlas.quarantine.agreement.standing(agent)),
-                }
-                for agent, own in self._counters.runs.items()
-            },
-            "maps": atlas.map_sizes(),
+            "agents": agents,
+            "maps": maps,
+            "unlisted_maps": len(sizes) - len(maps),
+            "unlisted_keyframes": len(atlas) - sum(maps.values()),
             "waiting": len(self.queries),
             **self._counters.report(len(atlas.loop_acceptance.pending), len(atlas.graph.edges.loops)),
         }

@@ -77,17 +77,25 @@ class MapperCounters:
         self.runs: dict[str, RunCounters] = {}
         self.steps: Counter[str] = Counter()
         self.removed_keyframes = self.failed_steps = 0
-        self._removed_runs = RunCounters()
+        self._totals = RunCounters()
         self._step_ms = {kind: deque[float](maxlen=_MAX_STEP_TIMES) for kind in STEP_KINDS}
 
     def add_run(self, agent: str) -> None:
         self.runs[agent] = RunCounters()
 
     def remove_run(self, agent: str) -> None:
-        """Forget a run; its loops and merges stay in the totals."""
-        counters = self.runs.pop(agent)
-        self._removed_runs.loops_tried += counters.loops_tried
-        self._removed_runs.merges += counters.merges
+        """Forget a run; the totals keep its loops and merges."""
+        del self.runs[agent]
+
+    def count_tried(self, agent: str) -> None:
+        """Count a pair of views that was verified for a keyframe of this run."""
+        for counters in (self.runs[agent], self._totals):
+            counters.loops_tried += 1
+
+    def count_merge(self, agent: str, outcome: str) -> None:
+        """Count a loop of this run. outcome: see `RunCounters`."""
+        for counters in (self.runs[agent], self._totals):
+            counters.merges[outcome] += 1
 
     def add_step(self, kind: str, ms: float) -> None:
         self._step_ms[kind].append(ms)
@@ -95,12 +103,10 @@ class MapperCounters:
 
     def report(self, pending_count: int, loop_count: int) -> dict[str, Any]:
         """Totals of all runs and durations of steps, for edge.json. Counts: of loops now in the map."""
-        runs = [*self.runs.values(), self._removed_runs]
-        merges = merge_counts(sum((run.merges for run in runs), Counter()))
-        tried = sum(run.loops_tried for run in runs)
+        merges = merge_counts(self._totals.merges)
         return {
             "loops": {
-                "tried": tried,
+                "tried": self._totals.loops_tried,
                 "accepted": merges["done"],
                 "waiting": pending_count,
                 "in_map": loop_count,

@@ -1,4 +1,4 @@
-"""Odometry segments as the agents sent them, their ranks, and the runs of each agent."""
+"""Odometry segments as the agents sent them, and their ranks."""
 
 from __future__ import annotations
 
@@ -52,13 +52,15 @@ class Segment:
 class OdometrySegments:
     """Nodes by id, in order of arrival, and the segments that they form, oldest first.
 
-    live_segments: those that still have nodes.
+    live_segments: those that still have nodes. by_name: the newest segment of each name.
     """
 
     def __init__(self) -> None:
         self.nodes: dict[int, Node] = {}
         self.segments: list[Segment] = []
         self.live_segments: dict[int, None] = {}
+        self.by_name: dict[str, int] = {}
+        self._live_of_agent: dict[str, dict[int, None]] = {}
         self._next_id = 0
         self._node_ids: dict[KeyframeKey, int] = {}
         self._current: dict[str, int] = {}  # current segment of each agent
@@ -85,8 +87,9 @@ class OdometrySegments:
         """Begin a segment, which becomes the agent's current one, and return its index."""
         count = self._segment_counts.get(agent, 0)
         self._segment_counts[agent] = count + 1
-        self._current[agent] = len(self.segments)
-        self.segments.append(Segment(agent, f"{agent}/{count}", rank))
+        segment = Segment(agent, f"{agent}/{count}", rank)
+        self._current[agent] = self.by_name[segment.name] = len(self.segments)
+        self.segments.append(segment)
         return len(self.segments) - 1
 
     def append_node(
@@ -98,7 +101,7 @@ class OdometrySegments:
         node_id, self._next_id = self._next_id, self._next_id + 1
         self.nodes[node_id] = Node(key, segment, ordinal, T_odom_body)
         target.nodes.append(node_id)
-        self.live_segments[segment] = None
+        self.live_segments[segment] = self._live_of_agent.setdefault(target.agent, {})[segment] = None
         target.total_count = ordinal + 1
         self._node_ids[key] = node_id
         return node_id
@@ -106,16 +109,17 @@ class OdometrySegments:
     def remove_node(self, node_id: int) -> None:
         """Remove a node; its segment continues without it."""
         node = self.nodes.pop(node_id)
-        nodes = self.segments[node.segment].nodes
-        nodes.remove(node_id)
-        if not nodes:
-            del self.live_segments[node.segment]
+        segment = self.segments[node.segment]
+        segment.nodes.remove(node_id)
+        if not segment.nodes:
+            del self.live_segments[node.segment], self._live_of_agent[segment.agent][node.segment]
         del self._node_ids[node.key]
 
     def remove_agent(self, agent: str) -> None:
         """Forget an agent without nodes. Its segments keep their indices."""
         self._current.pop(agent, None)
         self._segment_counts.pop(agent, None)
+        self._live_of_agent.pop(agent, None)
 
     def newest_node(self, agent: str) -> int | None:
         """Newest node of the agent's current segment, or None."""
@@ -123,7 +127,11 @@ class OdometrySegments:
         return nodes[-1] if nodes else None
 
     def has_nodes(self, agent: str) -> bool:
-        return any(self.segments[segment].agent == agent for segment in self.live_segments)
+        return bool(self._live_of_agent.get(agent))
+
+    def live_segments_of(self, agent: str) -> list[int]:
+        """Return the agent's segments that still have nodes, oldest first."""
+        return sorted(self._live_of_agent.get(agent, ()))
 
     def has_keyframe(self, key: KeyframeKey) -> bool:
         return key in self._node_ids
@@ -182,61 +190,3 @@ def restored_ranks(config: Config, stored: StoredMap) -> list[int]:
         segment_rank(config, hellos.get(name.rpartition("/")[0]), is_reference=name in references)
         for name in stored.segments
     ]
-
-
-# Runs of each agent: which are connected, and which is the current one of a name.
-
-
-class AgentRuns:
-    """Runs by agent name, and which runs are connected. An unregistered run is present under its own id."""
-
-    def __init__(self) -> None:
-        self._name_by_run: dict[str, str] = {}
-        self._present_run: dict[str, str] = {}  # current run of each name, by when it last connected
-        self._absent: set[str] = set()
-
-    def add(self, run: str, name: str) -> None:
-        """Register a new run, which becomes the current one of its name."""
-        self._name_by_run[run] = name
-        self.set_present(run, True)
-
-    def set_present(self, run: str, is_present: bool) -> bool:
-        """Set whether a run is connected; return whether that changed.
-
-        A run that reconnects becomes the current one of its name again.
-        """
-        was_absent = run in self._absent
-        if not is_present:
-            self._absent.add(run)
-            return not was_absent
-        self._absent.discard(run)
-        name = self.name(run)
-        self._present_run.pop(name, None)
-        self._present_run[name] = run
-        return was_absent
-
-    def remove(self, run: str) -> None:
-        name = self._name_by_run.pop(run, run)
-        self._absent.discard(run)
-        if self._present_run.get(name) == run:
-            del self._present_run[name]
-            if remaining := [one for one in self._name_by_run if self._name_by_run[one] == name]:
-                self._present_run[name] = remaining[-1]
-
-    def name(self, run: str) -> str:
-        return self._name_by_run.get(run, run)
-
-    def is_absent(self, run: str) -> bool:
-        return run in self._absent
-
-    def is_name_absent(self, name: str) -> bool:
-        """Return whether the current run of this name is not connected."""
-        return self._present_run.get(name, name) in self._absent
-
-    def is_superseded(self, run: str) -> bool:
-        """Return whether the run is not connected and its name has a newer run."""
-        return run in self._absent and self._present_run.get(self.name(run), run) != run
-
-    def presence_order(self) -> dict[str, int]:
-        """Rank of each name by when its current run last connected, oldest first."""
-        return {name: i for i, name in enumerate(self._present_run)}

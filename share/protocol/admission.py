@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from share.config import EdgeConfig
+from share.mapping.agent_runs import AgentRuns
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MAX_FORGOTTEN_RUNS
 from share.protocol.edge_events import PeerMessageReceived
@@ -15,8 +16,8 @@ from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
 from share.wire.messages import Hello, PoseUpdate, peer_tag, public_tag
 
-# Limits on new runs, each at once and a second: each run stays in the report, and in the map once it has a
-# keyframe. One name: as many as a person starts while trying things out; one key: a full room; the edge: two.
+# Limits on new runs, each at once and a second: each run stays in the map once it has a keyframe. One name:
+# as many as a person starts while trying things out; one key: a full room; the edge: two.
 _NAME_LIMIT, _CREDENTIAL_LIMIT, _EDGE_LIMIT = (8.0, 0.1), (32.0, 0.25), (128.0, 2.0)
 _SILENT_S = 0.6  # an agent pings every 0.5 s
 NAME_HOLD_S = 3.0  # a name stays in use for this long after its agent's last message
@@ -140,9 +141,9 @@ class RunRegistry(Mapping[bytes, Peer]):
     def __init__(self, forgotten: Mapping[str, int]) -> None:
         self.unjoined = Sender()
         self.by_key: dict[str, Peer] = {}
-        self._present: dict[str, Peer] = {}
         self._peers: dict[bytes, Peer] = {}
-        self._runs_by_name: dict[str, dict[str, Peer]] = {}  # by key, the latest last
+        self._runs = AgentRuns()
+        self._idle: dict[str, Peer] = {}  # absent runs without a keyframe
         self._empty_runs: dict[str, int] = {}  # runs without anything in the map: their newest keyframe
         self._forgotten: dict[str, ForgottenRun] = {}  # by public tag, the latest last
         for tag, next_keyframe in forgotten.items():
@@ -164,33 +165,41 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     def present(self) -> list[Peer]:
         """Return the runs that have not left."""
-        return list(self._present.values())
+        return [self.by_key[key] for key in self._runs.present()]
+
+    def listed(self, max_names: int) -> list[Peer]:
+        """Return the runs that a report lists: see `AgentRuns.listed`."""
+        return [self.by_key[key] for key in self._runs.listed(max_names)]
 
     def mark_present(self, peer: Peer) -> None:
         """Record that a known run takes part; it becomes the latest of its name."""
         peer.is_gone = False
-        self._present[peer.key] = peer
-        runs = self._runs_by_name.setdefault(peer.name, {})
-        runs.pop(peer.key, None)
-        runs[peer.key] = peer
+        self._runs.set_present(peer.key, True)
+        self._idle.pop(peer.key, None)
 
     def mark_gone(self, peer: Peer) -> None:
         """Record that a run has left."""
         peer.is_gone = True
-        self._present.pop(peer.key, None)
+        self._runs.set_present(peer.key, False)
+        if peer.is_idle:
+            self._idle[peer.key] = peer
+
+    def mark_heard(self, peer: Peer) -> None:
+        """Record that a run which has left sent something: a report lists it again."""
+        self._runs.set_present(peer.key, False)
 
     def is_latest(self, peer: Peer) -> bool:
         """Return whether no other run of its name joined or came back later."""
-        return next(reversed(self._runs_by_name[peer.name])) == peer.key
+        return self._runs.is_latest(peer.key)
 
     def shares_map(self, peer: Peer) -> bool:
         """Return whether a run shares a map with another that is present, or no other is."""
-        others = [other for other in self._present.values() if other is not peer]
+        others = [other for other in self.present() if other is not peer]
         return not others or peer.map_id in {other.map_id for other in others} - {None}
 
     def latest_poses(self) -> dict[str, PoseUpdate]:
         """Return the newest pose of each present run, by run key."""
-        return {key: peer.latest_pose for key, peer in self._present.items() if peer.latest_pose is not None}
+        return {peer.key: peer.latest_pose for peer in self.present() if peer.latest_pose is not None}
 
     def label(self, peer: Peer) -> str:
         """Return the run's label in reports: its name if it is the latest, else name/tag. No name contains
@@ -201,6 +210,7 @@ class RunRegistry(Mapping[bytes, Peer]):
     def add(self, peer: Peer) -> None:
         """Add a run that takes part."""
         self._peers[peer.id] = self.by_key[peer.key] = peer
+        self._runs.add(peer.key, peer.name)
         self.mark_present(peer)
 
     def restore(self, run: RestoredRun, session: int) -> None:
@@ -250,10 +260,9 @@ class RunRegistry(Mapping[bytes, Peer]):
         return was_latest
 
     def _remove(self, peer: Peer) -> None:
-        del self.by_key[peer.key], self._peers[peer.id], self._runs_by_name[peer.name][peer.key]
-        self._present.pop(peer.key, None)
-        if not self._runs_by_name[peer.name]:
-            del self._runs_by_name[peer.name]
+        del self.by_key[peer.key], self._peers[peer.id]
+        self._runs.remove(peer.key)
+        self._idle.pop(peer.key, None)
 
     def _remember(self, tag: str, run: ForgottenRun) -> None:
         self._forgotten.pop(tag, None)
@@ -271,7 +280,6 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     def oldest_idle(self) -> Peer | None:
         """Return the oldest of too many runs without a keyframe, None if they are not too many."""
-        idle = [peer for peer in self._peers.values() if peer.is_idle]
-        if len(idle) < _MAX_IDLE:
+        if len(self._idle) < _MAX_IDLE:
             return None
-        return min(idle, key=lambda peer: (peer.last_received_ns, peer.id))
+        return min(self._idle.values(), key=lambda peer: (peer.last_received_ns, peer.id))

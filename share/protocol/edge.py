@@ -58,6 +58,7 @@ class EdgeProtocol:
         forgotten: Mapping[str, int] | None = None,
     ) -> None:
         self._config, self._session, self._registry = config, session, RunRegistry(forgotten or {})
+        self._config_report = to_mapping(config)
         for run in restored:
             self._registry.restore(run, session)
         self.latest_poses = self._registry.latest_poses
@@ -127,6 +128,8 @@ class EdgeProtocol:
     def _on_message(self, event: ed.PeerMessageReceived) -> None:
         peer, client = self._registry.get(event.peer_id), self.room.clients.get(event.peer_id)
         sender = client or self._registry.sender(event.peer_id)
+        if peer is not None and peer.is_gone:
+            self._registry.mark_heard(peer)
         sender.counts["bytes_up"] += message_bytes(event.frames)
         try:
             message = decode(event.frames)
@@ -357,8 +360,8 @@ class EdgeProtocol:
 
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, with `agents` by run key. Names of
-        runs are `RunRegistry.label`."""
-        peers, mapped = self._registry.values(), map_report.get("agents", {})
+        runs are `RunRegistry.label`. Of absent runs it lists the recent ones and counts the rest."""
+        peers, mapped = self._registry.listed(self._config.edge.max_agents), map_report.get("agents", {})
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
@@ -367,6 +370,7 @@ class EdgeProtocol:
                 self._registry.label(peer): self._peer_report(peer) | mapped.get(peer.key, {})
                 for peer in peers
             },
+            "unlisted_runs": len(self._registry) - len(peers),
             "unjoined": dict(self._registry.unjoined.counts),
             "refused": [
                 *filter(None, [self._rate_scheduler.full_reason(self._out.now_ns)]),
@@ -377,5 +381,5 @@ class EdgeProtocol:
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._registry.forgotten_count,
             "version": __version__,
-            "config": to_mapping(self._config),
+            "config": self._config_report,
         }

@@ -7,6 +7,7 @@ agent stays where the room is.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -33,17 +34,18 @@ class KnownMaps:
 
     def __init__(self) -> None:
         self._corrections: dict[str, Correction] = {}  # the newest of each run
+        self._shown = Counter[str]()  # by map: runs whose newest correction it is
         self._segment_starts: dict[str, int] = {}  # by run: first keyframe of its present segment
         self._joins: dict[str, MapsJoined] = {}  # by absorbed map: not followed by an agent yet
         self._moves: dict[str, MapMoved] = {}  # by old map: joins that have been followed
         self._solved: frozenset[str] = frozenset()
 
     def __contains__(self, map_id: str) -> bool:
-        return map_id in self.ids()
+        return map_id in self._solved or map_id in self._shown
 
     def ids(self) -> frozenset[str]:
         """Return the maps of the runs' newest corrections, and those of the newest solution."""
-        return self._solved | {correction.map_id for correction in self._corrections.values()}
+        return self._solved | self._shown.keys()
 
     def add_solved(self, map_ids: Collection[str]) -> None:
         """Set the maps of the newest solution."""
@@ -54,8 +56,18 @@ class KnownMaps:
         self._segment_starts[run] = keyframe
 
     def forget(self, run: str) -> None:
-        self._corrections.pop(run, None)
+        self._set_correction(run, None)
         self._segment_starts.pop(run, None)
+
+    def _set_correction(self, run: str, correction: Correction | None) -> None:
+        """Set the newest correction of a run; None: the run is forgotten."""
+        if (old := self._corrections.pop(run, None)) is not None:
+            self._shown[old.map_id] -= 1
+            if not self._shown[old.map_id]:
+                del self._shown[old.map_id]
+        if correction is not None:
+            self._corrections[run] = correction
+            self._shown[correction.map_id] += 1
 
     def record_join(self, joined: MapsJoined) -> None:
         """Record a join of the mapper; agents follow it with their next correction."""
@@ -68,7 +80,7 @@ class KnownMaps:
         start, old = self._segment_starts.get(run, 0), self._corrections.get(run)
         if correction.segment_keyframe < start:
             return None
-        self._corrections[run] = correction
+        self._set_correction(run, correction)
         self._moves.pop(correction.map_id, None)  # it is there, perhaps again
         if old is None or old.map_id == correction.map_id or old.segment_keyframe < start:
             return None

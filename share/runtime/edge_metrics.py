@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class MetricSpec:
     """One metric. path: dotted keys to its number in the report, or in each entry of the report's mapping
-    `over`. labels: first the entry's key, then dotted keys in the entry.
+    `over`; of several paths with "+" between them the sum. labels: first the entry's key, then dotted keys in
+    the entry.
 
     Names and units follow Prometheus, *Metric and label naming*; counters (..._total) only grow.
     """
@@ -37,8 +38,9 @@ METRICS: tuple[MetricSpec, ...] = (
     MetricSpec("share_edge_degraded", "Number of losses of the map file; /health lists them.", "degraded"),
     MetricSpec("share_edge_failed_steps_total", "Steps of the mapper that raised an error.", "failed_steps"),
     MetricSpec("share_edge_refused_handshakes_total", "Refused attempts to connect.", "refused_handshakes"),
-    MetricSpec("share_edge_maps", "Separate maps.", "maps"),
+    MetricSpec("share_edge_maps", "Separate maps.", "maps+unlisted_maps"),
     MetricSpec("share_edge_map_keyframes", "Keyframes in a map.", "", "maps", ("map",)),
+    MetricSpec("share_edge_unlisted_runs", "Earlier runs without metrics of their own.", "unlisted_runs"),
     MetricSpec("share_edge_room_agents", "Agents in a room of a site.", "agents", "rooms", ("room",)),
     MetricSpec("share_edge_room_keyframes", "Keyframes of a room.", "keyframes", "rooms", ("room",)),
     MetricSpec("share_edge_room_waiting_keyframes", "Waiting, of a room.", "waiting", "rooms", ("room",)),
@@ -189,9 +191,9 @@ class _Collector:
 
 def _samples(report: dict[str, Any], row: MetricSpec) -> Iterator[tuple[list[str], float]]:
     for name, entry in _entries(report, row.over):
-        number = _as_number(_lookup(entry, row.path))
-        if number is not None:
-            yield [name, *_labels(entry, row.labels[1:])][: len(row.labels)], number * row.scale
+        numbers = [_as_number(_lookup(entry, path)) for path in row.path.split("+")]
+        if known := [number for number in numbers if number is not None]:
+            yield [name, *_labels(entry, row.labels[1:])][: len(row.labels)], sum(known) * row.scale
 
 
 def _info(report: dict[str, Any]) -> Metric:

@@ -227,10 +227,9 @@ class RoomKeeper:
         if self._room is not None:
             self._room.show_poses()
 
-    def maps(self) -> Mapping[str, int]:
-        """Return the number of keyframes of each map, as far as it is known."""
-        maps: Mapping[str, int] = self._last_report.get("maps", {})
-        return (self._room.maps() or maps) if self._room is not None else maps
+    def may_have_map(self, map_id: str) -> bool:
+        """As `ServedRoom.may_have_map`; nothing changes in a sleeping room."""
+        return self._room is None or self._room.may_have_map(map_id)
 
     def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of edge.json; of a sleeping room, as it was."""

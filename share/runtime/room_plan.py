@@ -22,6 +22,7 @@ _STEP_M, _MAX_STEP_M = 0.1, 0.2  # between points of a path; more, and it cuts a
 _MAX_POINTS = 600  # of a segment's path; beyond, every second is left out, and then the oldest are
 _MAX_SEGMENTS = 8  # of a run; the oldest are forgotten
 _KEPT_KEYFRAMES = 64  # newest, of a run; poses are relative to one of them
+_MAX_AGENTS = 256  # that are drawn; beyond, those are whose keyframes came last
 _UPDATE_EVERY = 4  # calls: poses are shown twenty times a second or more
 
 
@@ -101,21 +102,32 @@ class RoomPlan(EdgeObserver):
 
     def __init__(self) -> None:
         self._runs: dict[str, _Run] = {}
+        self._drawn: dict[str, str] = {}  # runs by name, the one whose keyframe came last is last
         self._calls = 0
 
     def begin_session(self, map_file: Path | None, known: Sequence[RestoredRun]) -> None:
         kept = {run.key: self._runs[run.key] for run in known if run.key in self._runs}
         self._runs = {run.key: kept.get(run.key) or _run_of(run.hello) for run in known}
+        self._drawn = {name: key for name, key in self._drawn.items() if key in kept}
 
     def add_effect(self, effect: EdgeEffect) -> None:
         match effect:
             case AddRun():
                 self._runs[effect.key] = _run_of(effect.hello)
+                self._drawn.pop(effect.hello.name, None)
             case AddKeyframe() if (run := self._runs.get(effect.key)) is not None:
                 keyframe = effect.keyframe
                 run.add_keyframe(keyframe.id, keyframe.T_odom_body, keyframe.reference < 0)
-            case DropRun():
-                self._runs.pop(effect.key, None)
+                self._draw(run.name, effect.key)
+            case DropRun() if (gone := self._runs.pop(effect.key, None)) is not None:
+                if self._drawn.get(gone.name) == effect.key:
+                    del self._drawn[gone.name]
+
+    def _draw(self, name: str, key: str) -> None:
+        self._drawn.pop(name, None)
+        self._drawn[name] = key
+        if len(self._drawn) > _MAX_AGENTS:
+            del self._drawn[next(iter(self._drawn))]
 
     def add_result(self, result: MapperResult) -> None:
         for map_event in result.map_events:
@@ -135,8 +147,8 @@ class RoomPlan(EdgeObserver):
     def report(self) -> dict[str, Any]:
         """Return `/plan.json`: of each agent's newest run, by name, the parts of its path by map, and where
         it is. Runs without a place are left out."""
-        newest = {run.name: run for run in list(self._runs.values())}
-        reports = {name: run.report() for name, run in newest.items()}
+        drawn = [self._runs.get(key) for key in list(self._drawn.values())]
+        reports = {run.name: run.report() for run in drawn if run is not None}
         return {"agents": {name: report for name, report in reports.items() if report["parts"]}}
 
 

@@ -188,10 +188,10 @@ class ServedRoom:
         if self._mapper_process is not None:
             self._mapper_process.send(request)
 
-    def maps(self) -> Mapping[str, int]:
-        """Return the number of keyframes of each map, by the mapper's newest report."""
-        maps: Mapping[str, int] = self._progress.report.get("maps", {})
-        return maps
+    def may_have_map(self, map_id: str) -> bool:
+        """Return whether there may be a map of this name, by the mapper's newest report, if there is one."""
+        report = self._progress.report
+        return not report or map_id in report.get("maps", {}) or report.get("unlisted_maps", 0) > 0
 
     # ------------------------------------------------------------------ what is shown
 

@@ -29,7 +29,6 @@ from share.runtime.room_host import RoomHost
 from share.runtime.room_keeper import IDLE_S, RoomKeeper
 from share.runtime.served_room import ServedRoom
 from share.runtime.spare_mapper import SpareMapper
-from share.site.building import RoomMap
 from share.site.directory import PlaceDirectory, RoomRanking
 from share.site.report import site_report
 from share.site.room_switch import RoomPort, RoomSwitch
@@ -149,9 +148,7 @@ class SiteRooms:
         self._switch.move_waiting(time.monotonic_ns())
         if time.monotonic() >= self._maps_due_s:
             self._maps_due_s = time.monotonic() + _MAPS_S
-            self._switch.building.keep(
-                {RoomMap(name, one) for name, room in self._rooms.items() for one in room.maps()}
-            )
+            self._switch.building.keep(lambda one: self._rooms[one.room].may_have_map(one.map_id))
 
     def stop(self) -> None:
         """From now on the death of a process is expected. Safe from any thread and from a signal handler."""

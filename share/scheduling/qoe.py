@@ -22,6 +22,7 @@ ACCEPTED_DELAY_MS = 20.0  # d0: a headset wearer does not notice less
 REFERENCE_ACCURACY = 1.0  # a0, 1/cm
 MIN_ERROR_CM = 0.05  # smaller estimates count as this
 _MAX_EXPONENT = 700.0  # exp of it is still finite
+_NO_OVERRIDE = AgentQoe()
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class QoeParameters:
     @classmethod
     def from_config(cls, config: ControlConfig, kind: AgentKind, agent: str = "") -> QoeParameters:
         """Return the parameters of an agent: its entry in `control.agents`, else the defaults of its form."""
-        override = config.agents.get(agent, AgentQoe())
+        override = config.agents.get(agent, _NO_OVERRIDE)
         form = AgentKind(override.form or kind)
         if form is AgentKind.AR:
             defaults = (config.ar_beta, config.ar_gamma, config.robot_theta_ms, config.ar_target)

@@ -8,6 +8,7 @@ of the first of them. The graph has a node for each map, so no solution spans th
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -64,9 +65,9 @@ class BuildingGraph:
         self._crossings.setdefault(pair, deque(maxlen=_MAX_PER_PAIR)).append(crossing)
         self._solve()
 
-    def keep(self, maps: set[RoomMap]) -> None:
-        """Forget the maps that are not among these: they have become part of others, or are gone."""
-        gone = {one for pair in self._crossings for one in pair} - maps
+    def keep(self, may_exist: Callable[[RoomMap], bool]) -> None:
+        """Forget the maps that do not exist: they have become part of others, or are gone."""
+        gone = {one for pair in self._crossings for one in pair if not may_exist(one)}
         if gone:
             self._crossings = {
                 pair: crossings for pair, crossings in self._crossings.items() if not gone & {*pair}

@@ -12,7 +12,8 @@ from share.site.building import BuildingPose, RoomMap
 
 _LINES = "refused", "trouble", "degraded", "agent_trouble"
 _BY_NAME = "maps", "objects", "robots"
-_COUNTS = "waiting", "failed_steps", "removed_keyframes", "internal_errors", "forgotten_runs"
+_UNLISTED = "unlisted_runs", "unlisted_maps", "unlisted_keyframes"
+_COUNTS = "waiting", "failed_steps", "removed_keyframes", "internal_errors", "forgotten_runs", *_UNLISTED
 _ROOM_FIELDS = "session", "policy", "asleep", "loading", "last_solve_s", "loops", "merges", *_COUNTS
 
 
@@ -21,15 +22,15 @@ def site_report(
 ) -> dict[str, Any]:
     """Return one report of all rooms. Agents are those of all rooms, each with its `room`; one that has been
     in several is reported by the one where it is now. Lines name their room. poses: of maps in the building;
-    a room has that of its largest map."""
+    a room has that of its largest map. A run that is not listed is counted in every room that knows it."""
     first = next(iter(reports.values()))
     agents = _agents(reports)
     rooms = {
         room: {name: report[name] for name in _ROOM_FIELDS if name in report}
         | {
             "agents": sum(agent["room"] == room and not agent["gone"] for agent in agents.values()),
-            "keyframes": sum(report.get("maps", {}).values()),
-            "maps": len(report.get("maps", {})),
+            "keyframes": sum(report.get("maps", {}).values()) + report.get("unlisted_keyframes", 0),
+            "maps": len(report.get("maps", {})) + report.get("unlisted_maps", 0),
             **_place(room, report.get("maps", {}), poses),
         }
         for room, report in reports.items()

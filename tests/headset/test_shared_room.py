@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.many_runs import work_of
 
 from share.geometry import se3
 from share.headset.page_messages import MAX_POINTS
@@ -157,3 +158,35 @@ def test_a_session_that_begins_forgets_all() -> None:
     room.pose("ann-1", EYE, 0)
     room.apply(ev.SessionBegun())
     assert room.poses() == [] and room.take_poses() == [] and room.agents() == []
+
+
+def test_agents_that_were_here_once_cost_nothing() -> None:
+    def work(count: int) -> int:
+        room = Playing()
+        for k in range(count):
+            room.agent(f"n{k}", AgentKind.AR)
+            room.pose(f"n{k}-1", EYE, 1000)
+        gone = {f"n{k}": {"run": f"n{k}-1", "gone": True, "state": "OK"} for k in range(count)}
+        room.apply(ev.AgentsReported(gone, (), 0))
+        assert len(room.take_poses()) == count
+        room.pose("ann-1", at(1.0), 1033)
+        assert [one["name"] for one in room.agents()] == ["ann"]
+        room.pose("ann-1", at(1.0), 1066)
+        return work_of(lambda: (room.agents(), room.poses(), room.take_poses()))
+
+    assert work(100) == work(10)
+
+
+def test_an_earlier_run_that_comes_back_is_shown_again() -> None:
+    room = Playing()
+    room.pose("ann-1", at(1.0), 1000)
+    room.apply(ev.AgentsReported({"ann": {"run": "ann-1", "gone": True, "state": "OK"}}, (), 0))
+    room.agent("ann", AgentKind.AR, run=2)
+    room.pose("ann-2", at(2.0), 1033)
+    both = {
+        "ann": {"run": "ann-1", "gone": False, "state": "OK"},
+        "ann/2": {"run": "ann-2", "gone": True, "state": "OK"},
+    }
+    room.apply(ev.AgentsReported(both, (), 0))
+    (shown,) = room.poses()
+    assert shown["position"] == [1.0, 0.0, 0.0]

@@ -10,11 +10,12 @@ from helpers.atlas_sim import EMPTY, STEP, UP, UP_SIGMA, Walker, loop
 
 from share.config import MergeConfig
 from share.geometry import se3
+from share.mapping.agent_runs import AgentRuns
 from share.mapping.atlas import Atlas
 from share.mapping.culling import fair_quotas
 from share.mapping.loop_consistency import articulation_segments
 from share.mapping.loops import KeyframeKey
-from share.mapping.segments import MIN_LOOP_GAP, AgentRuns
+from share.mapping.segments import MIN_LOOP_GAP
 from share.types import F64, Keyframe
 
 CONFIG = MergeConfig()

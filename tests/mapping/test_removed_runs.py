@@ -384,6 +384,7 @@ def test_the_report_shows_the_run_before_a_removed_one(tmp_path: Path) -> None:
             session.now_ns += 10 * S
             session.tell(1, m.Ping(0, 0))
             session.handle(Tick())
+        session.tell(100, m.Bye())  # or it would not be listed: more names came later
         report = session.edge.report(session.mapper.report())
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
 

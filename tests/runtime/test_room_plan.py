@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from helpers import map_changes as mc
 from helpers.hellos import hello_of
+from helpers.many_runs import work_of
 
 from share.geometry import se3
 from share.mapping.corrections import map_assignment
 from share.protocol.edge_events import AddKeyframe, AddRun, DropRun, MapperResult
 from share.protocol.peer import RestoredRun
+from share.runtime import room_plan
 from share.runtime.room_plan import RoomPlan
 from share.types import F64, AgentKind, TrackState
 from share.wire.messages import PoseUpdate
@@ -114,3 +116,29 @@ def test_a_long_path_keeps_its_bends_and_its_newest_part(plan: RoomPlan) -> None
     assert 100 < len(path) <= 600
     assert np.linalg.norm((path[1:] + path[:-1]) / 2, axis=1).min() > 1.48
     assert np.linalg.norm(path[-1] - [1.5, 0.0]) < 0.25
+
+
+def test_agents_that_were_here_long_ago_cost_nothing(plan: RoomPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room_plan, "_MAX_AGENTS", 3)
+
+    def come(count: int) -> int:
+        """Runs of new names, each with a place, and then ann; return how much work a report is."""
+        for k in range(count):
+            key = f"n{count}x{k}-1"
+            plan.add_effect(AddRun(key, hello_of(key.removesuffix("-1"), k)))
+            plan.add_effect(AddKeyframe(key, mc.keyframe(key, 0, first=True).keyframe))
+            plan.add_result(MapperResult((map_assignment(key, "A", at(0.0, 0.0), 0),)))
+        keyframe(plan, count, at(0.0, 0.0))
+        corrected(plan, at(0.0, 0.0))
+        assert list(plan.report()["agents"]) == [f"n{count}x{count - 2}", f"n{count}x{count - 1}", "ann"]
+        return work_of(plan.report)
+
+    assert come(100) == come(10)
+
+
+def test_a_run_that_comes_back_is_drawn(plan: RoomPlan) -> None:
+    corrected(plan, at(0.0, 0.0))
+    plan.add_effect(AddRun("ann-2", hello_of("ann", 2)))
+    assert plan.report() == {"agents": {}}
+    keyframe(plan, 1, at(1.0, 0.0))
+    assert plan.report()["agents"]["ann"]["map_id"] == "A"

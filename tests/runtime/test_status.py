@@ -650,3 +650,17 @@ def test_close_ends_the_thread_and_frees_the_port():
     assert "web" not in {thread.name for thread in threading.enumerate()}
     with serving(address=endpoint) as again:
         assert again.endpoint == endpoint
+
+
+def test_metrics_count_what_the_report_does_not_list():
+    def samples(report):
+        body, _ = edge_metrics.render_metrics(report)
+        families = text_string_to_metric_families(body.decode())
+        return {(one.name, *one.labels.values()): one.value for family in families for one in family.samples}
+
+    unlisted = {"unlisted_runs": 40, "unlisted_maps": 7, "unlisted_keyframes": 90}
+    found = samples({"maps": {"a/0": 12, "b/0": 1}, **unlisted})
+    assert (found["share_edge_maps",], found["share_edge_unlisted_runs",]) == (9, 40)
+    assert found["share_edge_map_keyframes", "a/0"] == 12
+    assert samples(REPORT)["share_edge_maps",] == 2
+    assert ("share_edge_maps",) not in samples({"unlisted_runs": 0})

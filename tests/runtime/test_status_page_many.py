@@ -53,6 +53,7 @@ def documents(count: int) -> dict[str, str]:
     snapshot = {
         **{"agents": agents, "maps": {f"m{k}": 12 for k in order}, "uptime_s": 5.0, "session": 1},
         **{"policy": "share", "version": "0.2.0", "waiting": 0},
+        **({"unlisted_runs": 40, "unlisted_maps": 7, "unlisted_keyframes": 90} if count < 10 else {}),
     }
     plan = {"agents": {f"agent{k}": place(k) for k in order}}
     return {
@@ -116,3 +117,10 @@ def test_of_few_agents_all_is_shown(shown: str) -> None:
     table = shown[shown.index('id="agents"') : shown.index('id="hint"')]
     assert 'class="words"' in table and shown.count("<details open") == 7
     assert '<details id="plans" hidden=""><summary></summary>' in shown and "1 m a square: agent2<" in shown
+
+
+@pytest.mark.parametrize("shown", [3], indirect=True)
+def test_what_is_not_listed_is_counted(shown: str) -> None:
+    assert ">40 earlier runs not listed<" in shown
+    maps = shown[shown.index('id="maps"') : shown.index('id="rooms-section"')]
+    assert re.search(r">7 more</td><td[^>]*>90<", maps)

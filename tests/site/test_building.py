@@ -83,9 +83,9 @@ def test_maps_that_are_gone_are_forgotten():
     graph = BuildingGraph()
     cross(graph, HALL, LAB)
     cross(graph, LAB, KITCHEN)
-    graph.keep({HALL, LAB})
+    graph.keep({HALL, LAB}.__contains__)
     assert set(graph.poses) == {HALL, LAB}
-    graph.keep({HALL, LAB, ATTIC})
+    graph.keep({HALL, LAB, ATTIC}.__contains__)
     assert set(graph.poses) == {HALL, LAB}
     cross(graph, LAB, LAB)
     assert set(graph.poses) == {HALL, LAB}

@@ -57,3 +57,14 @@ def test_the_plan_has_the_paths_of_all_rooms_and_one_place():
         shown = site_plan(plans, {"ann": {"room": where}})["agents"]["ann"]
         assert shown["position"] == [x, 0.0]
         assert [part["map_id"] for part in shown["parts"]] == ["a/0", "b/0"]
+
+
+def test_a_room_counts_the_maps_that_it_does_not_list():
+    unlisted = {"unlisted_runs": 7, "unlisted_maps": 3, "unlisted_keyframes": 20}
+    report = site_report(
+        {"lab": room({}, maps={"a/0": 3}, **unlisted), "hall": room({}, unlisted_runs=1)}, {}
+    )
+    lab, hall = report["rooms"]["lab"], report["rooms"]["hall"]
+    assert (lab["maps"], lab["keyframes"], lab["unlisted_runs"]) == (4, 23, 7)
+    assert (hall["maps"], hall["keyframes"]) == (0, 0)
+    assert [report[name] for name in unlisted] == [8, 3, 20]

@@ -10,7 +10,7 @@ wrong; the pair is disputed, and each keeps its own map. All runs of a name are 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Mapping
+from collections.abc import Collection, Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -90,13 +90,13 @@ class AgentAgreement:
 
     def add_step(self, run: str, node_id: int, previous_id: int | None, T_ref_body: F64, cov: F64) -> bool:
         """Add a node, by odometry from the previous one; None: it begins a segment. Return whether scales may
-        have changed, or those of the run are new."""
+        have changed."""
         previous = None if previous_id is None else self._accumulated.get(previous_id)
         self._accumulated[node_id] = (
             AccumulatedOdometry.origin() if previous is None else previous.with_step(T_ref_body, cov)
         )
         if previous_id is None:
-            return True
+            return False
         return self.covariance_scales.add_step(self.identities.identity(run), T_ref_body, cov)
 
     def log_scale(self, run: str) -> float:
@@ -106,6 +106,11 @@ class AgentAgreement:
     def covariance_scale(self, run: str) -> float:
         """Factor on the variances of the run's odometry."""
         return self.covariance_scales.scales.get(self.identities.identity(run), 1.0)
+
+    def scaled_runs(self) -> set[str]:
+        """Return the runs of agents that have a log scale or a covariance scale."""
+        agents = self.log_scales.keys() | self.covariance_scales.scales.keys()
+        return {run for agent in agents for run in self.identities.runs(agent)}
 
     def remove_nodes(self, node_ids: Collection[int], live: Container[int]) -> None:
         """Remove nodes. live: segments that still have nodes; see `AgentPair.end_segments` for the loops of
@@ -180,11 +185,31 @@ class AgentAgreement:
 
     def standing(self, run: str) -> AgentConsistency:
         """Return how the run's agent agrees with the others."""
-        agent = self.identities.identity(run)
-        pairs = {names: pair for names, pair in self.pairs.items() if agent in names}
+        return self.standings([run])[run]
+
+    def standings(self, runs: Sequence[str]) -> dict[str, AgentConsistency]:
+        """Return how the agents of these runs agree with the others."""
+        pairs_by_agent: dict[str, dict[AgentNames, AgentPair]] = {}
+        for names, pair in self.pairs.items():
+            for agent in names:
+                pairs_by_agent.setdefault(agent, {})[names] = pair
+        agents, scales = {run: self.identities.identity(run) for run in runs}, self._estimate_scales()
+        known = {
+            agent: self._standing(agent, pairs_by_agent.get(agent, {}), scales.get(agent, (None, None)))
+            for agent in dict.fromkeys(agents.values())
+        }
+        return {run: known[agent] for run, agent in agents.items()}
+
+    def _standing(
+        self,
+        agent: str,
+        pairs: Mapping[AgentNames, AgentPair],
+        scale: tuple[float, float] | tuple[None, None],
+    ) -> AgentConsistency:
+        """pairs: those with this agent. scale: log scale and sigma of its depths."""
         disagreeing = [(names, pair) for names, pair in pairs.items() if pair.disagrees]
         nis = max((pair.nis for pair in pairs.values() if pair.nis is not None), default=None)
-        log, sigma = self._estimate_scales().get(agent, (None, None))
+        log, sigma = scale
         state = "agrees" if any(pair.agrees for pair in pairs.values()) else "unknown"
         reason = ""
         if agent in self.quarantined:
@@ -205,7 +230,7 @@ class AgentAgreement:
             self.log_scales.get(agent, 0.0),
             nis,
             worst,
-            self.covariance_scale(agent),
+            self.covariance_scales.scales.get(agent, 1.0),
         )
 
     def _unverified_cause(self, unverified: str) -> str:

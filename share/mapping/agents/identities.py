@@ -62,7 +62,7 @@ class AgentIdentities:
         self._credentials: dict[str, str | None] = {}  # of names with a key
         self._identity_by_run: dict[str, str] = {}
         self._names: dict[str, str] = {}  # of identities
-        self._runs: dict[str, list[str]] = {}  # of identities
+        self._runs: dict[str, dict[str, None]] = {}  # of identities, the newest last
         self._newest: dict[str, str] = {}  # newest identity of each name
         self._suspect_names: dict[str, bool] = {}  # names of removed suspects; whether one was quarantined
 
@@ -115,9 +115,7 @@ class AgentIdentities:
 
     def _assign(self, run: str, identity: str) -> None:
         self._identity_by_run[run] = identity
-        runs = self._runs.setdefault(identity, [])
-        if run not in runs:
-            runs.append(run)
+        self._runs.setdefault(identity, {})[run] = None
 
     def remove_run(self, run: str, quarantined: Collection[str], disputed: Collection[str]) -> str | None:
         """Forget a run; return its identity if that was its last run.
@@ -125,9 +123,9 @@ class AgentIdentities:
         quarantined, disputed: current identities. Suspicion passes to the next run of the name.
         """
         identity = self.identity(run)
-        runs = self._runs.get(identity, [run])
+        runs = self._runs.get(identity, {run: None})
         if run in runs:
-            runs.remove(run)
+            del runs[run]
             self._identity_by_run.pop(run, None)
         if runs:
             return None
@@ -169,8 +167,12 @@ class AgentIdentities:
         together = [credentials | dict.fromkeys(unknown, credential) for credential in (None, *known)]
         return [credentials | {identity: f"of {identity}" for identity in unknown}, *together]
 
+    def runs(self, identity: str) -> Iterable[str]:
+        """Return the runs of an identity, the newest last; of an unregistered run itself."""
+        return self._runs.get(identity, {identity: None})
+
     def newest_run(self, identity: str) -> str:
-        return self._runs.get(identity, [identity])[-1]
+        return next(reversed(self._runs.get(identity, {identity: None})))
 
     def had_quarantined_run(self, run: str, quarantined: Iterable[str]) -> bool:
         """Return whether another identity of the run's name was quarantined, or is in `quarantined`."""

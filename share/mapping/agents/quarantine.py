@@ -7,7 +7,7 @@ Small scale errors are corrected, and understated variances enlarged.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -56,8 +56,11 @@ class Quarantine:
     def add_step(self, node_id: int, T_ref_body: F64, cov: F64) -> None:
         """Add a node, by odometry from the previous one of its segment."""
         odometry = self._graph.odometry
-        agent = odometry.nodes[node_id].key.agent
-        if self.agreement.add_step(agent, node_id, odometry.previous_node(node_id), T_ref_body, cov):
+        agent, previous = odometry.nodes[node_id].key.agent, odometry.previous_node(node_id)
+        may_have_changed = self.agreement.add_step(agent, node_id, previous, T_ref_body, cov)
+        if previous is None:  # the run may be new
+            self._apply_scales_to([agent])
+        elif may_have_changed:
             self.apply_scales()
 
     def add_loop(self, loop: Loop, depth_scale: DepthScale | None) -> QuarantineChange:
@@ -94,6 +97,8 @@ class Quarantine:
     def quarantined_nodes(self, agent: str) -> tuple[int, ...]:
         """Nodes of agents that must not share a map with this one."""
         odometry = self._graph.odometry
+        if not self.agreement.quarantined and not self.agreement.disputed:
+            return ()
         segments = [odometry.segments[segment] for segment in sorted(odometry.live_segments)]
         separated = {s.agent for s in segments if self.agreement.are_separated(agent, s.agent)}
         return tuple(n for s in segments if s.agent in separated for n in s.nodes) if separated else ()
@@ -132,10 +137,14 @@ class Quarantine:
         return self._graph.log_scales.get(agent, 0.0)
 
     def apply_scales(self) -> None:
+        """Correct the odometry of agents whose scales have changed."""
+        has_nodes = self._graph.odometry.has_nodes
+        runs = self.agreement.scaled_runs() | self._graph.log_scales.keys()
+        self._apply_scales_to(sorted(run for run in runs if has_nodes(run)))
+
+    def _apply_scales_to(self, runs: Iterable[str]) -> None:
         agreement, graph = self.agreement, self._graph
-        for agent in sorted(
-            {graph.odometry.segments[segment].agent for segment in graph.odometry.live_segments}
-        ):
+        for agent in runs:
             scales = agreement.log_scale(agent), agreement.covariance_scale(agent)
             if scales != (self._log_scale(agent), graph.covariance_scales.get(agent, 1.0)):
                 graph.rescale_odometry(agent, *scales)
@@ -145,10 +154,7 @@ class Quarantine:
         quarantined.
         """
         identities = self.agreement.identities
-        maps = [
-            self._agents_in_map(reference_segment)
-            for reference_segment in sorted(set(self._graph.reference_segments))
-        ]
+        maps = [self._agents_in_map(reference_segment) for reference_segment in sorted(self._graph.maps)]
         names = [set(map(identities.name, agents)) for agents in maps]
         largest = max(range(len(maps)), key=lambda i: len(names[i]), default=0)
         trusted = maps[largest] if maps and len(names[largest]) > 1 else set[str]()
@@ -163,8 +169,9 @@ class Quarantine:
         are_separated, loops = self.agreement.are_separated, graph.edges.loops
         loops_between = [n for n, loop in loops.items() if are_separated(loop.a.agent, loop.b.agent)]
         dropped = graph.drop_loops(loops_between) if loops_between else ()
-        for a, b in itertools.combinations(sorted(graph.odometry.live_segments), 2):
-            if graph.reference_segments[a] == graph.reference_segments[b] and self.agreement.are_separated(
+        maps = list(graph.maps.values())
+        for a, b in itertools.chain.from_iterable(itertools.combinations(sorted(own), 2) for own in maps):
+            if graph.reference_segments[a] == graph.reference_segments[b] and are_separated(
                 segments[a].agent, segments[b].agent
             ):
                 dropped += self._loop_acceptance.split_segments(a, b)
