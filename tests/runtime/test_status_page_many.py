@@ -122,5 +122,5 @@ def test_of_few_agents_all_is_shown(shown: str) -> None:
 @pytest.mark.parametrize("shown", [3], indirect=True)
 def test_what_is_not_listed_is_counted(shown: str) -> None:
     assert ">40 earlier runs not listed<" in shown
-    maps = shown[shown.index('id="maps"') : shown.index('id="rooms-section"')]
+    maps = shown[shown.index('id="maps"') : shown.index('id="robots"')]
     assert re.search(r">7 more</td><td[^>]*>90<", maps)
