@@ -101,7 +101,7 @@ def edge(path, monkeypatch):
         assert not thread.is_alive()
 
 
-def until(condition, seconds=30):
+def until(condition, seconds=120):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
