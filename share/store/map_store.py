@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sqlite3
 import time
@@ -30,7 +31,7 @@ from share.store.loading import (
 )
 from share.store.salvage import ReadRows, read_intact_rows, salvage, set_aside
 
-__all__ = ["MapStore", "is_map"]
+__all__ = ["MapStore", "is_map", "oldest_arrival_s"]
 
 
 class MapStore:
@@ -277,3 +278,11 @@ def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
             status = file.stat()
             out[file] = status.st_dev, status.st_ino
     return out
+
+
+def oldest_arrival_s(path: Path) -> float:
+    """Return when the oldest keyframe in a map file arrived, unix s; infinity if it has none. Raises
+    StoreError."""
+    with database.translate_errors(path, "read"), contextlib.closing(database.open_for_reading(path)) as db:
+        (oldest_s,) = first_row(db, "SELECT min(unix_s) FROM arrival")
+    return math.inf if oldest_s is None else float(oldest_s)

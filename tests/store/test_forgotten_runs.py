@@ -137,3 +137,17 @@ def test_a_map_that_takes_the_place_of_one_that_is_set_aside_knows_them(path: Pa
         assert store.load().runs == ()
         assert store.load().forgotten == {ANNS_TAG: 20}
     assert loaded(path).forgotten == {ANNS_TAG: 20}
+
+
+@pytest.mark.parametrize(("codec", "hello"), [(99, b"\x91\xc4\x00"), (8, b"\xff\xff")])
+def test_a_run_that_cannot_be_read_is_removed_all_the_same(path: Path, codec: int, hello: bytes) -> None:
+    """An error would hold up the writing of all that follows."""
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        for table in ("run", "run_copy"):
+            insert(connection, table, ("eve-0004", 7, codec, hello))
+    with MapStore.open(path) as store:
+        store.write([RemoveRun("eve-0004")])
+    kept = loaded(path)
+    assert [one.run_key for one in kept.runs] == [BOB]
+    assert kept.forgotten == {ANNS_TAG: 20}
+    assert kept.problems == ()
