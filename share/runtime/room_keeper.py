@@ -283,7 +283,7 @@ def _close_file(room: ServedRoom, path: Path | None) -> _FileClosed:
 def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotOpened:
     stamp = _file_stamp(path)
     try:
-        if closed_stamp is not None and stamp is None:  # its folder may come back
+        if stamp is None:  # its folder may come back
             raise StoreError(f"{path}: is gone since its room fell asleep; put it back, or restart the edge")
         store = MapStore.open(path)
         if not store.writable:  # keyframes would be acknowledged that no file has
@@ -291,7 +291,7 @@ def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotO
             raise StoreError(f"{path}: the map cannot be written: {store.read_only_reason}")
         with contextlib.suppress(Exception):  # said when the room starts, or the file is set aside then
             store.outline()  # which takes a while, and is kept
-        return _FileOpened(store, closed_stamp is not None and stamp == closed_stamp)
+        return _FileOpened(store, stamp == closed_stamp)
     except Exception as error:  # such as a folder of another machine that is away
         return _NotOpened(_reason(error))
 

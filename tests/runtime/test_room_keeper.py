@@ -321,10 +321,13 @@ def test_a_map_that_can_no_longer_be_written_keeps_the_room_asleep(bench, monkey
     assert bench.rooms[1].store.writable
 
 
-def test_a_map_file_that_is_gone_is_not_made_anew(bench, tmp_path):
-    bench.step_until(is_awake=False)
+@pytest.mark.parametrize("is_asleep", [False, True])
+def test_a_map_file_that_is_gone_is_not_made_anew(bench, tmp_path, is_asleep):
     path, away = tmp_path / "room.sqlite", tmp_path / "away"
+    if is_asleep:
+        bench.step_until(is_awake=False)
     path.rename(away)
+    bench.step_until(is_awake=False)
     bench.keeper.handle(hello())
     assert "is gone since its room fell asleep" in line_of(bench)
     assert not path.exists()
