@@ -8,7 +8,7 @@ import math
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -212,9 +212,10 @@ class MapStore:
             return read_only(self.path).rows
         return read_intact_rows(self._db, schema.SMALL_TABLES)
 
-    def set_aside(self) -> Path:
+    def set_aside(self, forgotten: Mapping[str, int]) -> Path:
         """Rename the map and start an empty one in its place, which knows the removed runs too. Return the
-        new name of the old one.
+        new name of the old one. forgotten: removed runs that are known, as in `StoredMap`: the old one may be
+        damaged.
 
         Raises ShareError if that fails: then the map is unchanged, or the new one knows none.
         """
@@ -227,7 +228,7 @@ class MapStore:
             self._start_writing()
         with database.translate_errors(self.path, "written"), self._writable_db() as db:
             db.execute("BEGIN IMMEDIATE")
-            add_forgotten(db, rows.read_forgotten_runs(about)[0])
+            add_forgotten(db, {**rows.read_forgotten_runs(about)[0], **forgotten})
         return renamed
 
     def close(self) -> None:
