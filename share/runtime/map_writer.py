@@ -67,9 +67,10 @@ class MapWriter:
             self._notify(f"{unsaved} changes {_NOT_IN_FILE}; none of their keyframes was acknowledged")
         return True
 
-    def close(self) -> str | None:
-        """Drain and close the file. Return why the file is or may be incomplete, None if it is complete."""
-        if not self.drain(_TIMEOUT_S):
+    def close(self, timeout_s: float | None = None) -> str | None:
+        """Drain and close the file; abandon it where that takes longer than `timeout_s`, by default a few
+        seconds. Return why the file is or may be incomplete, None if it is complete."""
+        if not self.drain(_TIMEOUT_S if timeout_s is None else timeout_s):
             self._store.abandon()
             return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         self._store.close()

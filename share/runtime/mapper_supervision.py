@@ -111,7 +111,8 @@ class MapperRestarts:
             self.store = None
             text = f"the map file is no longer used: {reason}; nothing is saved"
         else:
-            renamed = self.store.set_aside()
+            renamed = self.store.set_aside(self.forgotten or {})
+            self.forgotten = self.store.outline().forgotten  # of the file too, which may not have been read
             text = f"the map file is renamed to {renamed.name}: {reason}; a new one is started"
         self._asides.append(text)
         self._notify(text)

@@ -1,7 +1,7 @@
 """One room of a site, which sleeps while nobody is in it: no mapper, no open map file.
 
 awake -> nobody for a while -> a thread closes the room -> asleep
-      -> a message for it, or a keyframe to search -> the thread opens the map file -> awake
+      -> a message for it, a keyframe to search or to forget -> the thread opens the map file -> awake
 
 A room without a map file, or with one that may not be written, is always awake.
 """
@@ -9,6 +9,7 @@ A room without a map file, or with one that may not be written, is always awake.
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import time
 from collections import deque
@@ -18,14 +19,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from share.errors import ShareError, WireError
+from share.errors import ShareError, StoreError, VersionError, WireError, describe_exception
 from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
+from share.protocol.versions import refusal_of_version
 from share.runtime.output_writer import JobThread
 from share.runtime.served_room import ServedRoom
-from share.store.map_store import MapStore
+from share.store.map_store import MapStore, oldest_arrival_s
 from share.timing import Backoff
 from share.wire.codec import decode
 from share.wire.messages import Hello
@@ -34,6 +36,7 @@ from share.wire.room_messages import ClientHello
 IDLE_S = 60.0  # without anybody, after which a room falls asleep
 _MAX_WAITING = 64  # messages, and keyframes to search, that wait until the room is awake
 _TIMEOUT_S = 10.0  # for the thread at the end
+_MAX_CLOSE_S = 86_400.0  # for the disk, when a room falls asleep
 
 ServeRoom = Callable[[MapStore | None, SessionTotals, bool], ServedRoom]
 FileStamp = tuple[int, int, int]
@@ -46,7 +49,10 @@ class _ProcessesEnded:
 
 @dataclass(frozen=True)
 class _FileClosed:
+    """oldest_s: when the oldest keyframe in the file arrived, unix s; infinity where all are kept."""
+
     incomplete_reason: str | None
+    oldest_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +77,7 @@ class RoomKeeper:
     serve: starts the room with its opened map file, after earlier sessions with these totals, and whether the
     file is as the last one has left it; raises StoreError. notify: takes a line for the event
     log. wake: has `step` called soon; safe from any thread. idle_s: without anybody, until it sleeps.
+    keep_s: how long keyframes are kept; None: for ever.
     """
 
     def __init__(
@@ -80,8 +87,10 @@ class RoomKeeper:
         notify: Callable[[str], None],
         wake: Callable[[], None],
         idle_s: float,
+        keep_s: float | None = None,
     ) -> None:
         self._serve, self._notify, self._wake_loop, self._idle_s = serve, notify, wake, idle_s
+        self._keep_s = keep_s
         self._path = store.path if store is not None and store.writable else None
         self._totals = SessionTotals()
         self._thread = JobThread("room")
@@ -95,7 +104,8 @@ class RoomKeeper:
         self._backoff = Backoff(time.monotonic_ns())
         self._last_report: dict[str, Any] = {}
         self._last_series: Mapping[str, Mapping[str, Any]] = {}
-        self._used_s = time.monotonic()
+        self._used_s = self._asleep_s = time.monotonic()  # last used, fallen asleep
+        self._expiry_s = math.inf  # when the first keyframe of a sleeping room is too old, unix s
         self._closing: ServedRoom | None = None  # as long as the thread closes it
         self._closed_stamp: FileStamp | None = None  # of the map file as the room has left it
         self._room: ServedRoom | None = serve(store, self._totals, False)
@@ -144,7 +154,7 @@ class RoomKeeper:
                 self._used_s = now_s
             elif self._path is not None and now_s - self._used_s >= self._idle_s:
                 self._fall_asleep(self._room)
-        elif self._path is not None and self._is_called and not self._is_changing and now_s >= self._retry_s:
+        elif self._path is not None and not self._is_changing and self._is_to_wake(now_s):
             self._submit(partial(_open_map, self._path, self._closed_stamp))
 
     def stop(self) -> None:
@@ -155,6 +165,8 @@ class RoomKeeper:
     def close(self) -> str | None:
         """End all processes and threads. Return why the map file is incomplete, None if it is complete."""
         if not self._thread.stop(_TIMEOUT_S):
+            if self._closing is None:  # it reads the file
+                return None
             return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         while not self._answers.empty():
             if isinstance(answer := self._answers.get(), _FileOpened):
@@ -164,13 +176,17 @@ class RoomKeeper:
 
     # ------------------------------------------------------------------ sleep
 
+    def _is_to_wake(self, now_s: float) -> bool:
+        is_called = self._is_called or time.time() >= self._expiry_s
+        return is_called and now_s >= self._retry_s
+
     def _fall_asleep(self, room: ServedRoom) -> None:
         self._last_protocol, self._last_series, self._last_report = (
             room.protocol,
             room.series(),
             room.report(),
         )
-        self._totals = room.end_totals()
+        self._totals, self._asleep_s = room.end_totals(), time.monotonic()
         self._room, self._closing = None, room
         self._submit(partial(_end_processes, room))
 
@@ -189,9 +205,12 @@ class RoomKeeper:
         match answer:
             case _ProcessesEnded() if self._closing is not None:
                 self._closing.handle_answers()
-                self._submit(partial(_close_file, self._closing))
-            case _FileClosed(incomplete_reason) if self._closing is not None:
+                self._submit(
+                    partial(_close_file, self._closing, None if self._keep_s is None else self._path)
+                )
+            case _FileClosed(incomplete_reason, oldest_s) if self._closing is not None:
                 self._closing.finish(incomplete_reason)
+                self._expiry_s = oldest_s + (self._keep_s or 0.0)
                 self._closing, self._closed_stamp = None, _file_stamp(self._path)
             case _FileOpened(store, is_unchanged):
                 self._wake_up(store, is_unchanged)
@@ -201,11 +220,12 @@ class RoomKeeper:
     def _wake_up(self, store: MapStore, is_unchanged: bool) -> None:
         try:
             self._room = self._serve(store, self._totals, is_unchanged)
-        except ShareError as error:
+        except Exception as error:  # such as too many open files: the other rooms go on
             store.close()
-            self._retry_later(str(error))
+            self._retry_later(_reason(error))
             return
         self._failure, self._is_called, self._used_s = "", False, time.monotonic()
+        self._expiry_s = math.inf
         for request in self._searches:
             self._room.find(request)
         for event in self._messages:
@@ -240,7 +260,8 @@ class RoomKeeper:
         if self._room is not None:
             return self._room.report()
         trouble = [self._failure] if self._failure else []
-        return {**self._last_report, "trouble": trouble, "asleep": True}
+        report = _aged(self._last_report, time.monotonic() - self._asleep_s)
+        return {**report, "refused": [], "trouble": trouble, "asleep": True}
 
 
 def _end_processes(room: ServedRoom) -> _ProcessesEnded:
@@ -248,19 +269,51 @@ def _end_processes(room: ServedRoom) -> _ProcessesEnded:
     return _ProcessesEnded()
 
 
-def _close_file(room: ServedRoom) -> _FileClosed:
-    return _FileClosed(room.close_file())
+def _close_file(room: ServedRoom, path: Path | None) -> _FileClosed:
+    """Close the map file, however long its disk takes: nobody waits for it, and a file that is given up stays
+    locked. path: where keyframes that are too old are to be forgotten."""
+    incomplete_reason = room.close_file(_MAX_CLOSE_S)
+    try:
+        oldest_s = math.inf if path is None else oldest_arrival_s(path)
+    except Exception:
+        oldest_s = -math.inf  # said when the file is opened, which is due now
+    return _FileClosed(incomplete_reason, oldest_s)
 
 
 def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotOpened:
-    is_unchanged = closed_stamp is not None and _file_stamp(path) == closed_stamp
+    stamp = _file_stamp(path)
     try:
+        if stamp is None:  # its folder may come back
+            raise StoreError(f"{path}: is gone since its room fell asleep; put it back, or restart the edge")
         store = MapStore.open(path)
+        if not store.writable:  # keyframes would be acknowledged that no file has
+            store.close()
+            raise StoreError(f"{path}: the map cannot be written: {store.read_only_reason}")
         with contextlib.suppress(Exception):  # said when the room starts, or the file is set aside then
             store.outline()  # which takes a while, and is kept
-        return _FileOpened(store, is_unchanged)
-    except ShareError as error:
-        return _NotOpened(str(error))
+        return _FileOpened(store, stamp == closed_stamp)
+    except Exception as error:  # such as a folder of another machine that is away
+        return _NotOpened(_reason(error))
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, ShareError) else describe_exception(error)
+
+
+def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:
+    """Return a room's report with the ages in it that much larger."""
+    return {
+        **_increased(report, last_solve_s=more_s),
+        "agents": {
+            name: _increased(agent, last_received_s=more_s, pose_age_ms=1e3 * more_s)
+            for name, agent in report.get("agents", {}).items()
+        },
+    }
+
+
+def _increased(fields: Mapping[str, Any], **more: float) -> dict[str, Any]:
+    older = {name: round(fields[name] + n, 3) for name, n in more.items() if fields.get(name) is not None}
+    return {**fields, **older}
 
 
 def _file_stamp(path: Path | None) -> FileStamp | None:
@@ -277,5 +330,7 @@ def _file_stamp(path: Path | None) -> FileStamp | None:
 def _is_hello(event: PeerMessageReceived) -> bool:
     try:
         return isinstance(decode(event.frames), Hello | ClientHello)
+    except VersionError as error:  # it is to hear that
+        return refusal_of_version(error) is not None
     except WireError:
         return False

@@ -155,9 +155,9 @@ class ServedRoom:
         while not self._inbox.empty():
             self._handle_answer(self._inbox.get())
 
-    def close_file(self) -> str | None:
-        """Close the map file. Return why it is incomplete, None if it is complete."""
-        return None if self._map_writer is None else self._map_writer.close()
+    def close_file(self, timeout_s: float | None = None) -> str | None:
+        """Close the map file; see `MapWriter.close`. Return why it is incomplete, None if it is complete."""
+        return None if self._map_writer is None else self._map_writer.close(timeout_s)
 
     def finish(self, incomplete_reason: str | None) -> None:
         """Acknowledge what has been saved at the end."""

@@ -17,6 +17,7 @@ from typing import Any
 from share.config import Config
 from share.event_kinds import EventKind
 from share.mapping.corrections import MapEvent
+from share.mapping.forgetting import DAY_S
 from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
@@ -86,7 +87,9 @@ class SiteRooms:
                 room_host = _RoomHost(name, host, self)
                 serve = partial(self._serve, setup, room_host, start_ns, has_keys)
                 notify = partial(room_host.log_event, "map")
-                self._rooms[name] = RoomKeeper(setup.store, serve, notify, host.wake, idle_s)
+                keep_days = setup.settings.edge.keep_days
+                keep_s = None if keep_days is None else keep_days * DAY_S
+                self._rooms[name] = RoomKeeper(setup.store, serve, notify, host.wake, idle_s, keep_s)
                 self._ports[name] = _Port(self._rooms[name])
         except BaseException:
             self.close()

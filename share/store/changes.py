@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from collections.abc import Mapping
 from typing import Any
 
+from share.errors import StoreError, WireError
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import (
     MAX_FORGOTTEN_RUNS,
@@ -144,7 +146,8 @@ def _delete_run(db: sqlite3.Connection, run: str) -> None:
     """Remove a run with its name; where keyframes of it were removed, it stays known by its tag."""
     row = first_row(db, "SELECT key, next, codec, hello FROM run WHERE key = ?", run)
     if row and (next_id := _next_id(db, run)):
-        add_forgotten(db, {public_tag(rows.read_run(row).hello.run_id): next_id})
+        with contextlib.suppress(ValueError, WireError, StoreError):  # of another version: it has no tag here
+            add_forgotten(db, {public_tag(rows.read_run(row).hello.run_id): next_id})
     for table, column in _RUN_COLUMNS:
         db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
     _set_credential(db, run, None)

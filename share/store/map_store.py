@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +31,7 @@ from share.store.loading import (
 )
 from share.store.salvage import ReadRows, read_intact_rows, salvage, set_aside
 
-__all__ = ["MapStore", "is_map"]
+__all__ = ["MapStore", "is_map", "oldest_arrival_s"]
 
 
 class MapStore:
@@ -211,9 +212,10 @@ class MapStore:
             return read_only(self.path).rows
         return read_intact_rows(self._db, schema.SMALL_TABLES)
 
-    def set_aside(self) -> Path:
+    def set_aside(self, forgotten: Mapping[str, int]) -> Path:
         """Rename the map and start an empty one in its place, which knows the removed runs too. Return the
-        new name of the old one.
+        new name of the old one. forgotten: removed runs that are known, as in `StoredMap`: the old one may be
+        damaged.
 
         Raises ShareError if that fails: then the map is unchanged, or the new one knows none.
         """
@@ -226,7 +228,7 @@ class MapStore:
             self._start_writing()
         with database.translate_errors(self.path, "written"), self._writable_db() as db:
             db.execute("BEGIN IMMEDIATE")
-            add_forgotten(db, rows.read_forgotten_runs(about)[0])
+            add_forgotten(db, {**rows.read_forgotten_runs(about)[0], **forgotten})
         return renamed
 
     def close(self) -> None:
@@ -277,3 +279,11 @@ def _read_file_ids(path: Path) -> dict[Path, tuple[int, int]]:
             status = file.stat()
             out[file] = status.st_dev, status.st_ino
     return out
+
+
+def oldest_arrival_s(path: Path) -> float:
+    """Return when the oldest keyframe in a map file arrived, unix s; infinity if it has none. Raises
+    StoreError."""
+    with database.translate_errors(path, "read"), contextlib.closing(database.open_for_reading(path)) as db:
+        (oldest_s,) = first_row(db, "SELECT min(unix_s) FROM arrival")
+    return math.inf if oldest_s is None else float(oldest_s)

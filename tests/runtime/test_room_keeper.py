@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from helpers.hellos import hello_of
+from helpers.map_changes import small_map
 
 from share.config import Config
 from share.errors import StoreError
@@ -19,6 +21,7 @@ from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import EdgeEvent, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
 from share.runtime.room_keeper import RoomKeeper
+from share.store import database
 from share.store.map_store import MapStore
 from share.wire.codec import encode
 from share.wire.messages import Ping, peer_id
@@ -55,7 +58,9 @@ class FakeRoom:
         pass
 
     def report(self) -> dict[str, Any]:
-        return {"maps": {"ann/0": 7}, "trouble": ["the solver: died"]}
+        agents = {"ann": {"gone": True, "last_received_s": 60.0, "pose_age_ms": None}}
+        lines = {"trouble": ["the solver: died"], "refused": ["12 messages refused"]}
+        return {"maps": {"ann/0": 7}, "agents": agents, **lines}
 
     def may_have_map(self, map_id: str) -> bool:
         return False
@@ -76,7 +81,7 @@ class FakeRoom:
     def handle_answers(self) -> None:
         self._note("handle_answers")
 
-    def close_file(self) -> str | None:
+    def close_file(self, timeout_s: float | None = None) -> str | None:
         self._note("close_file")
         if self.store is not None:
             self.store.close()
@@ -93,12 +98,12 @@ class FakeRoom:
 class Bench:
     """A keeper of fake rooms, over a real map file."""
 
-    def __init__(self, store: MapStore | None, idle_s: float = 0.0) -> None:
+    def __init__(self, store: MapStore | None, idle_s: float = 0.0, keep_s: float | None = None) -> None:
         self.rooms: list[FakeRoom] = []
         self.lines: list[str] = []
         self.is_failing = False
         self.woken = threading.Event()
-        self.keeper = RoomKeeper(store, self._serve, self.lines.append, self.woken.set, idle_s)
+        self.keeper = RoomKeeper(store, self._serve, self.lines.append, self.woken.set, idle_s, keep_s)
 
     def _serve(self, store: MapStore | None, totals: SessionTotals, is_unchanged: bool) -> Any:
         if self.is_failing:
@@ -281,7 +286,117 @@ def test_a_sleeping_room_is_shown_as_it_was(bench):
     assert report["asleep"] is True
     assert report["maps"] == {"ann/0": 7}
     assert bench.keeper.may_have_map("ann/0")
-    assert report["trouble"] == []
+    assert report["trouble"] == report["refused"] == []
+
+
+def test_the_ages_of_a_sleeping_room_grow(bench):
+    bench.step_until(is_awake=False)
+    first = bench.keeper.report()["agents"]["ann"]
+    time.sleep(0.1)
+    second = bench.keeper.report()["agents"]["ann"]
+    assert 60.0 <= first["last_received_s"] < second["last_received_s"] - 0.09
+    assert second["pose_age_ms"] is None
+
+
+def line_of(bench: Bench) -> str:
+    """Step until a line is said, and return it."""
+    deadline = time.monotonic() + 20.0
+    while not bench.lines:
+        assert time.monotonic() < deadline
+        bench.keeper.step()
+        time.sleep(0.005)
+    return bench.lines[0]
+
+
+def test_a_map_that_can_no_longer_be_written_keeps_the_room_asleep(bench, monkeypatch):
+    """Awake it would acknowledge keyframes that no file has."""
+    bench.step_until(is_awake=False)
+    obstacle = "its folder cannot be written: Read-only file system"
+    with monkeypatch.context() as patch:
+        patch.setattr(database, "write_obstacle", lambda path: obstacle)
+        bench.keeper.handle(hello())
+        assert obstacle in line_of(bench)
+    assert len(bench.rooms) == 1
+    bench.step_until(is_awake=True)
+    assert bench.rooms[1].store.writable
+
+
+@pytest.mark.parametrize("is_asleep", [False, True])
+def test_a_map_file_that_is_gone_is_not_made_anew(bench, tmp_path, is_asleep):
+    path, away = tmp_path / "room.sqlite", tmp_path / "away"
+    if is_asleep:
+        bench.step_until(is_awake=False)
+    path.rename(away)
+    bench.step_until(is_awake=False)
+    bench.keeper.handle(hello())
+    assert "is gone since its room fell asleep" in line_of(bench)
+    assert not path.exists()
+    away.rename(path)
+    bench.step_until(is_awake=True)
+
+
+def test_an_unforeseen_error_while_the_file_is_opened_is_said_and_it_is_tried_again(bench, monkeypatch):
+    def fails(path: Path) -> MapStore:
+        raise OSError(116, "Stale file handle")
+
+    bench.step_until(is_awake=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(MapStore, "open", fails)
+        bench.keeper.handle(hello())
+        assert "Stale file handle" in line_of(bench)
+    bench.step_until(is_awake=True)
+
+
+def test_a_room_that_cannot_start_ends_nothing_else(bench, tmp_path):
+    bench.step_until(is_awake=False)
+    serve = bench.keeper._serve
+
+    def fails(*arguments: Any) -> Any:
+        raise OSError(24, "Too many open files")
+
+    bench.keeper._serve = fails
+    bench.keeper.handle(hello())
+    assert "Too many open files" in line_of(bench)
+    assert not is_locked(tmp_path / "room.sqlite")
+    bench.keeper._serve = serve
+    bench.step_until(is_awake=True)
+
+
+def test_a_hello_of_another_version_wakes_it(bench):
+    """Its agent is to hear which side to upgrade; a ping is a probe, and stays unanswered."""
+    bench.step_until(is_awake=False)
+    for of, wakes in ((Ping(1, 1), False), (ANN, True)):
+        version, *rest = msgspec.msgpack.decode(encode(of)[0])
+        header = msgspec.msgpack.encode((version - 1, *rest))
+        bench.keeper.handle(PeerMessageReceived(peer_id(9), [header]))
+        bench.keeper.step()
+        assert (bench.is_awake is None) is wakes
+
+
+def test_it_wakes_up_when_a_keyframe_is_too_old(tmp_path):
+    """What is to be forgotten after some time is forgotten in a sleeping room too."""
+    store = MapStore.open(tmp_path / "room.sqlite")
+    store.write(small_map())
+    bench = Bench(store, keep_s=2.0)
+    bench.step_until(is_awake=False)
+    began_s = time.time()
+    bench.step_until(is_awake=True)
+    assert time.time() > began_s + 0.5
+    bench.keeper.close()
+
+
+def test_a_slow_disk_does_not_lock_the_file_for_ever(bench):
+    timeouts: list[float | None] = []
+    close = bench.rooms[0].close_file
+
+    def close_file(timeout_s: float | None = None) -> str | None:
+        timeouts.append(timeout_s)
+        return close()
+
+    bench.rooms[0].close_file = close_file
+    bench.step_until(is_awake=False)
+    assert timeouts[0] is not None
+    assert timeouts[0] > 3600.0
 
 
 def test_it_ends_well_in_every_state(tmp_path):

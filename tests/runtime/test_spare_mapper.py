@@ -56,3 +56,5 @@ def test_without_one_that_lives_and_may_start_now_a_new_one_is_started(made: lis
     assert made[2].delay_s == 3.0
     made[1].is_dead = True
     assert spare.take(print, print) is made[3]  # type: ignore[comparison-overlap]
+    assert spare.take(print, print) is made[4]  # type: ignore[comparison-overlap]
+    assert made[4].delay_s > 0.0  # it was prepared when the one before was taken

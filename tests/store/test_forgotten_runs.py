@@ -15,6 +15,7 @@ from share.mapping.map_changes import MapChange, RemoveKeyframes, RemoveRun, Sav
 from share.protocol import admission
 from share.protocol.admission import RunRegistry
 from share.protocol.peer import restored_runs
+from share.runtime.mapper_supervision import MapperRestarts
 from share.store import changes
 from share.store.map_store import MapStore
 from share.store.rows import insert
@@ -133,7 +134,33 @@ def test_what_is_no_number_is_said(path: Path) -> None:
 
 def test_a_map_that_takes_the_place_of_one_that_is_set_aside_knows_them(path: Path) -> None:
     with MapStore.open(path) as store:
-        assert store.set_aside().name == "room.sqlite.damaged-1"
+        assert store.set_aside({"00": 7}).name == "room.sqlite.damaged-1"
         assert store.load().runs == ()
-        assert store.load().forgotten == {ANNS_TAG: 20}
-    assert loaded(path).forgotten == {ANNS_TAG: 20}
+        assert store.load().forgotten == {ANNS_TAG: 20, "00": 7}
+    assert loaded(path).forgotten == {ANNS_TAG: 20, "00": 7}
+
+
+def test_the_session_that_sets_a_map_aside_knows_them(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(self: MapStore) -> StoredMap:
+        monkeypatch.undo()
+        raise IndexError("odd row")
+
+    monkeypatch.setattr(MapStore, "outline", fails)
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.1, print)
+        assert restarts.load_map() == (None, [])
+        assert restarts.forgotten == {ANNS_TAG: 20}
+
+
+@pytest.mark.parametrize(("codec", "hello"), [(99, b"\x91\xc4\x00"), (8, b"\xff\xff")])
+def test_a_run_that_cannot_be_read_is_removed_all_the_same(path: Path, codec: int, hello: bytes) -> None:
+    """An error would hold up the writing of all that follows."""
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        for table in ("run", "run_copy"):
+            insert(connection, table, ("eve-0004", 7, codec, hello))
+    with MapStore.open(path) as store:
+        store.write([RemoveRun("eve-0004")])
+    kept = loaded(path)
+    assert [one.run_key for one in kept.runs] == [BOB]
+    assert kept.forgotten == {ANNS_TAG: 20}
+    assert kept.problems == ()
