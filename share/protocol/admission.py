@@ -119,6 +119,7 @@ def name_objection(name: str, allowed_names: Collection[str]) -> str:
 
 
 # Registry of the runs that an edge knows, ended ones included.
+_MAX_MISSED = 64  # runs that went without a bye; more at once are the network's fault
 _MAX_IDLE = 256  # runs that left without a keyframe; beyond, the oldest is forgotten
 
 
@@ -144,6 +145,7 @@ class RunRegistry(Mapping[bytes, Peer]):
         self._peers: dict[bytes, Peer] = {}
         self._runs = AgentRuns()
         self._idle: dict[str, Peer] = {}  # absent runs without a keyframe
+        self._missed: dict[str, Peer] = {}  # that went without a bye, the latest last
         self._empty_runs: dict[str, int] = {}  # runs without anything in the map: their newest keyframe
         self._forgotten: dict[str, ForgottenRun] = {}  # by public tag, the latest last
         for tag, next_keyframe in forgotten.items():
@@ -167,15 +169,18 @@ class RunRegistry(Mapping[bytes, Peer]):
         """Return the runs that have not left."""
         return [self.by_key[key] for key in self._runs.present()]
 
-    def listed(self, max_names: int) -> list[Peer]:
-        """Return the runs that a report lists: see `AgentRuns.listed`."""
-        return [self.by_key[key] for key in self._runs.listed(max_names)]
+    def listed(self, max_names: int, now_ns: int) -> list[Peer]:
+        """Return the runs that a report lists: see `AgentRuns.listed`, and those that are missed."""
+        self._missed = {key: peer for key, peer in self._missed.items() if peer.is_missed(now_ns)}
+        listed = dict.fromkeys([*self._runs.listed(max_names), *self._missed])
+        return [self.by_key[key] for key in listed]
 
     def mark_present(self, peer: Peer) -> None:
         """Record that a known run takes part; it becomes the latest of its name."""
         peer.is_gone = False
         self._runs.set_present(peer.key, True)
         self._idle.pop(peer.key, None)
+        self._missed.pop(peer.key, None)
 
     def mark_gone(self, peer: Peer) -> None:
         """Record that a run has left."""
@@ -183,6 +188,10 @@ class RunRegistry(Mapping[bytes, Peer]):
         self._runs.set_present(peer.key, False)
         if peer.is_idle:
             self._idle[peer.key] = peer
+        if peer.is_missed(peer.last_received_ns):
+            self._missed[peer.key] = peer
+            if len(self._missed) > _MAX_MISSED:
+                del self._missed[next(iter(self._missed))]
 
     def mark_heard(self, peer: Peer) -> None:
         """Record that a run which has left sent something: a report lists it again."""
@@ -263,6 +272,7 @@ class RunRegistry(Mapping[bytes, Peer]):
         del self.by_key[peer.key], self._peers[peer.id]
         self._runs.remove(peer.key)
         self._idle.pop(peer.key, None)
+        self._missed.pop(peer.key, None)
 
     def _remember(self, tag: str, run: ForgottenRun) -> None:
         self._forgotten.pop(tag, None)

@@ -361,7 +361,8 @@ class EdgeProtocol:
     def report(self, map_report: dict[str, Any]) -> dict[str, Any]:
         """Return edge.json without `series`. map_report: of the mapper, with `agents` by run key. Names of
         runs are `RunRegistry.label`. Of absent runs it lists the recent ones and counts the rest."""
-        peers, mapped = self._registry.listed(self._config.edge.max_agents), map_report.get("agents", {})
+        peers = self._registry.listed(self._config.edge.max_agents, self._out.now_ns)
+        mapped = map_report.get("agents", {})
         return {
             "session": self._session,
             "policy": self._config.edge.policy,

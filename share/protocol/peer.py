@@ -239,8 +239,12 @@ class Peer(Sender):
         if not self.is_gone:
             joined_s = 0.0 if self.joined_ns is None else (now_ns - self.joined_ns) * 1e-9
             return report | {"trouble": agent_troubles(self.hello.kind, report, joined_s)}
-        is_missed = is_latest and self.has_sent and self.status.is_missed(now_ns, self.last_received_ns)
-        return report | {"trouble": [f"{SILENT}: {report['reason']}"] if is_missed else []}
+        is_trouble = is_latest and self.is_missed(now_ns)
+        return report | {"trouble": [f"{SILENT}: {report['reason']}"] if is_trouble else []}
+
+    def is_missed(self, now_ns: int) -> bool:
+        """Return whether it has gone without a bye, not long ago."""
+        return self.is_gone and self.has_sent and self.status.is_missed(now_ns, self.last_received_ns)
 
 
 def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list[str]:

@@ -141,3 +141,19 @@ def test_the_oldest_of_too_many_without_a_keyframe_is_forgotten() -> None:
     report = edge.report()
     assert len(report["agents"]) + report["unlisted_runs"] == 256 + 1
     assert edge.protocol.knows(peer_id(100)) is None and edge.protocol.knows(peer_id(100 + 299)) == 0
+
+
+def test_an_agent_that_vanished_stays_in_the_report_however_many_come_and_go() -> None:
+    edge = Edge(0)
+    edge.send(ZOE, ZOE)
+    edge.now_ns += 14 * 10**9
+    edge.handle(Tick())
+    assert edge.report()["agents"]["zoe"]["trouble"]
+    for hello in [hello_of(f"x{k}", k) for k in range(2, 120)]:
+        edge.send(hello, hello, m.Bye())
+    report = edge.report()
+    assert report["agents"]["zoe"]["trouble"]
+    assert report["unlisted_runs"] == 119 - len(report["agents"])
+    edge.now_ns += 60 * 10**9
+    edge.handle(Tick())
+    assert "zoe" not in edge.report()["agents"]
