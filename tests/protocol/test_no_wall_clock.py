@@ -22,6 +22,7 @@ ALLOWED = {
     "runtime/imu_bias_store.py": {"time.time_ns", "time.gmtime"},  # how old the bias of an earlier run is
     "store/map_store.py": {"time.time"},  # when a keyframe came, for `edge.keep_days`
     "runtime/mapper_process.py": {"time.time"},
+    "runtime/room_keeper.py": {"time.time"},
     "runtime/robot_bridge.py": {"time.time_ns"},  # how long a datagram has waited: the kernel stamps it so
     "runtime/doctor.py": {"time.time"},  # how old a calibration's file is
 }
