@@ -16,7 +16,7 @@ from share.store.map_store import MapStore
 _RETRY_S = 1.0  # after a failed write
 _SLOW_WRITE_S = 5.0  # duration of one write from which it is reported as trouble
 _MAX_PER_COMMIT = 64  # requests
-_TIMEOUT_S = 5.0  # for the remaining writes at the end
+CLOSE_S = 5.0  # for the remaining writes at the end
 _NOT_ACKNOWLEDGED = "keyframes are not acknowledged"
 _NOT_IN_FILE = "are not in the map file"
 
@@ -67,10 +67,10 @@ class MapWriter:
             self._notify(f"{unsaved} changes {_NOT_IN_FILE}; none of their keyframes was acknowledged")
         return True
 
-    def close(self, timeout_s: float | None = None) -> str | None:
-        """Drain and close the file; abandon it where that takes longer than `timeout_s`, by default a few
-        seconds. Return why the file is or may be incomplete, None if it is complete."""
-        if not self.drain(_TIMEOUT_S if timeout_s is None else timeout_s):
+    def close(self, timeout_s: float = CLOSE_S) -> str | None:
+        """Drain and close the file; abandon it where that takes longer than `timeout_s`. Return why the
+        file is or may be incomplete, None if it is complete."""
+        if not self.drain(timeout_s):
             self._store.abandon()
             return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         self._store.close()

@@ -48,7 +48,7 @@ from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
-from share.runtime.map_writer import MapWriter
+from share.runtime.map_writer import CLOSE_S, MapWriter
 from share.runtime.mapper_process import (
     MapperReport,
     MapRestored,
@@ -155,7 +155,7 @@ class ServedRoom:
         while not self._inbox.empty():
             self._handle_answer(self._inbox.get())
 
-    def close_file(self, timeout_s: float | None = None) -> str | None:
+    def close_file(self, timeout_s: float = CLOSE_S) -> str | None:
         """Close the map file; see `MapWriter.close`. Return why it is incomplete, None if it is complete."""
         return None if self._map_writer is None else self._map_writer.close(timeout_s)
 

@@ -166,14 +166,13 @@ def test_unsaved_changes_are_reported_at_the_end(opened):
     assert messages[-1] == "2 changes are not in the map file; none of their keyframes was acknowledged"
 
 
-def test_close_does_not_wait_for_a_disk_that_does_not_answer(opened, monkeypatch):
+def test_close_does_not_wait_for_a_disk_that_does_not_answer(opened):
     writer, disk, tickets, _ = opened
-    monkeypatch.setattr(map_writer, "_TIMEOUT_S", 0.05)
     disk.go_on.clear()
     writer.submit(SaveChanges(0, (change(0),)))
     until(lambda: disk.tries)
     assert not writer.drain(0.05)
-    assert "the disk of the map file does not answer" in writer.close()
+    assert "the disk of the map file does not answer" in writer.close(timeout_s=0.05)
     assert disk.abandoned
     assert not disk.closed  # which would wait for the write
     assert not tickets

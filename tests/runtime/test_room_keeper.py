@@ -12,6 +12,7 @@ import msgspec
 import pytest
 from helpers.hellos import hello_of
 from helpers.map_changes import small_map
+from helpers.map_files import is_locked
 
 from share.config import Config
 from share.errors import StoreError
@@ -144,14 +145,6 @@ def ping(of=ANN) -> PeerMessageReceived:
 
 def request() -> FindKeyframe:
     return FindKeyframe(KeyframeKey("ann", 1), None, ANN.rig)  # type: ignore[arg-type]
-
-
-def is_locked(path: Path) -> bool:
-    try:
-        MapStore.open(path).close()
-    except StoreError:
-        return True
-    return False
 
 
 def test_an_empty_room_closes_its_map_file_and_opens_it_for_a_hello(bench, tmp_path):

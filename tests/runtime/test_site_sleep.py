@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from helpers.hellos import hello_of
 from helpers.map_changes import pose, small_map
+from helpers.map_files import is_locked
 
 from share.config import Config
-from share.errors import StoreError
 from share.protocol.edge_events import PeerMessageReceived
 from share.runtime.edge_observer import EdgeObservers
 from share.runtime.site_rooms import RoomSetup, SiteRooms
@@ -45,14 +45,6 @@ def setup_of(folder: Path, name: str, changes: list[Any]) -> RoomSetup:
     store = MapStore.open(folder / f"{name}.sqlite")
     store.write(changes)
     return RoomSetup(name, Config(), store, EdgeObservers())
-
-
-def is_locked(path: Path) -> bool:
-    try:
-        MapStore.open(path).close()
-    except StoreError:
-        return True
-    return False
 
 
 @pytest.mark.long
