@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import SaveObject
@@ -18,6 +18,8 @@ from share.protocol.object_service import ObjectService
 from share.protocol.peer import fault_lines
 from share.wire import messages as wire
 from share.wire import room_messages as room
+
+CLIENT_MESSAGES = frozenset((*get_args(room.ClientUplink), wire.Ping, wire.Bye))  # what a client may send
 
 
 class ClientService:
@@ -74,9 +76,6 @@ class ClientService:
                 self._commands.on_state(client, message)
             case room.RobotPlace():
                 self._commands.on_place(client, message)
-            case _:
-                reason = f"a {type(message).__name__} which clients must not send"
-                client.count("unexpected", reason, self._out.now_ns)
 
     def send_away(self, name: str, reason: str) -> None:
         """Let the clients of an agent that goes on in another room say hello there."""

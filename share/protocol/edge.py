@@ -8,7 +8,7 @@ answers with map events; the map writer stores what must survive a crash and ans
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 from share import __version__
 from share.config import Config
@@ -18,7 +18,8 @@ from share.mapping.map_changes import SaveKeyframe, SaveObject, SavePoses, SaveR
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
 from share.protocol.admission import RunRegistry
-from share.protocol.client_service import ClientService
+from share.protocol.client_registry import Client
+from share.protocol.client_service import CLIENT_MESSAGES, ClientService
 from share.protocol.common_events import Tick
 from share.protocol.edge_membership import RoomMembership, RunTrackers
 from share.protocol.edge_records import EdgeOutput
@@ -28,13 +29,15 @@ from share.protocol.versions import refusal_of_version
 from share.scheduling.policies import AgentReport
 from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import Throttle
-from share.types import Keyframe
+from share.types import Frame, Keyframe
 from share.wire import messages as wire
-from share.wire.codec import decode, message_bytes
+from share.wire.codec import decode, message_bytes, message_type
 from share.wire.room_messages import ClientHello
 
 _NO_SESSION = 0  # in a pong to a client or a run that the edge has forgotten: it says hello again
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
+
+_BEFORE_HELLO: frozenset[type] = frozenset((wire.Hello, ClientHello, wire.Ping))  # what any peer may send
 
 
 class EdgeProtocol:
@@ -45,6 +48,8 @@ class EdgeProtocol:
     the times in records (default: the first event). trackers: those that the edge runs for its agents.
     forgotten: as in `StoredMap`.
     """
+
+    _agent_messages = frozenset(get_args(wire.UplinkMessage)) - {Frame} | {ClientHello}
 
     def __init__(
         self,
@@ -132,6 +137,10 @@ class EdgeProtocol:
             self._registry.mark_heard(peer)
         sender.counts["bytes_up"] += message_bytes(event.frames)
         try:
+            kind = message_type(event.frames)
+            if (reason := self._type_objection(kind, peer, client)) is not None:
+                sender.count("unexpected", reason, self._out.now_ns)
+                return
             message = decode(event.frames)
         except VersionError as error:
             self._on_other_version(event.peer_id, error)
@@ -149,7 +158,7 @@ class EdgeProtocol:
         match message:
             case ClientHello():
                 self.room.on_hello(event, message)
-            case wire.Hello() if client is None:
+            case wire.Hello():
                 self._membership.on_hello(event, message)
             case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
                 times = message.sent_ns, self._out.now_ns, self._out.now_ns
@@ -164,9 +173,16 @@ class EdgeProtocol:
                 self._membership.mark_gone(peer, "left", "sent bye")
             case _ if peer:
                 self._on_agent_message(peer, message)
-            case _:
-                reason = f"a {type(message).__name__} before its hello"
-                self._registry.unjoined.count("unexpected", reason, self._out.now_ns)
+
+    def _type_objection(self, kind: type, peer: Peer | None, client: Client | None) -> str | None:
+        """Return why this peer may not send such a message; None if it may."""
+        if client is not None:
+            allowed, objection = CLIENT_MESSAGES, ", which clients must not send"
+        elif peer is not None:
+            allowed, objection = self._agent_messages, ", which agents must not send"
+        else:
+            allowed, objection = _BEFORE_HELLO, " before its hello"
+        return None if kind in allowed else f"a message {kind.__name__}{objection}"
 
     def _has_forgotten(self, peer_id: bytes) -> bool:
         return self.room.clients.was_removed(peer_id) or self._registry.forgotten(peer_id) is not None
@@ -182,9 +198,6 @@ class EdgeProtocol:
                 peer.status.update(message, self._out.now_ns)
             case wire.Evaluation():
                 self._on_evaluation(peer, message)
-            case _:  # a downlink message
-                reason = f"a {type(message).__name__} which agents must not send"
-                peer.count("unexpected", reason, self._out.now_ns)
 
     def _on_evaluation(self, peer: Peer, evaluation: wire.Evaluation) -> None:
         peer.counts["evaluations"] += 1

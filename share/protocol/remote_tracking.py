@@ -20,6 +20,7 @@ from share.protocol.streaming import FrameWindow
 from share.types import Frame
 from share.wire import messages as wire
 from share.wire.messages import RemoteTrackingResult
+from share.wire.room_messages import ClientHello
 
 
 @dataclass
@@ -161,6 +162,8 @@ class TrackingEdge(EdgeProtocol):
     """An `EdgeProtocol` without mapper and map writer. It emits `TrackerEffect` and takes `TrackerEvent`.
     capacity: agents beyond it are refused; None: no limit."""
 
+    _agent_messages = frozenset((wire.Hello, ClientHello, wire.Ping, wire.Bye, wire.Status, Frame))
+
     def __init__(
         self,
         config: Config,
@@ -210,8 +213,6 @@ class TrackingEdge(EdgeProtocol):
                     self._out.add(*self._trackers[peer.key].offer_frame(message, self._out.now_ns))
                 except ValueError as error:
                     self._out.count_bad_message(peer, str(error))
-            case _:
-                peer.counts["unexpected"] += 1
 
     def _peer_report(self, peer: Peer) -> dict[str, Any]:
         return super()._peer_report(peer) | self._trackers[peer.key].report()

@@ -29,7 +29,7 @@ from share.runtime.output_writer import JobThread
 from share.runtime.served_room import ServedRoom
 from share.store.map_store import MapStore, oldest_arrival_s
 from share.timing import Backoff
-from share.wire.codec import decode
+from share.wire.codec import message_type
 from share.wire.messages import Hello
 from share.wire.room_messages import ClientHello
 
@@ -329,7 +329,7 @@ def _file_stamp(path: Path | None) -> FileStamp | None:
 
 def _is_hello(event: PeerMessageReceived) -> bool:
     try:
-        return isinstance(decode(event.frames), Hello | ClientHello)
+        return message_type(event.frames) in (Hello, ClientHello)
     except VersionError as error:  # it is to hear that
         return refusal_of_version(error) is not None
     except WireError:

@@ -148,7 +148,7 @@ class SiteRooms:
     def _continue_searches(self) -> None:
         while not self._rankings.empty():
             self._switch.add_ranking(self._rankings.get(), time.monotonic_ns())
-        self._switch.move_waiting(time.monotonic_ns())
+        self._switch.tick(time.monotonic_ns())
         if time.monotonic() >= self._maps_due_s:
             self._maps_due_s = time.monotonic() + _MAPS_S
             self._switch.building.keep(lambda one: self._rooms[one.room].may_have_map(one.map_id))
@@ -192,7 +192,7 @@ class SiteRooms:
         self._thread.submit(partial(self._directory.remove_room, room))
 
     def add_keyframe(self, added: AddKeyframe) -> None:
-        self._switch.add_keyframe(added)
+        self._switch.add_keyframe(added, time.monotonic_ns())
 
     def add_places(self, room: str, news: Sequence[PlaceNews]) -> None:
         self._thread.submit(partial(self._update_directory, room, news))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from share.errors import WireError
@@ -18,13 +19,14 @@ from share.site.directory import RoomRanking
 from share.site.room_finder import RoomFinder, RoomFound
 from share.timing import seconds_to_ns
 from share.types import Keyframe
-from share.wire.codec import decode
+from share.wire.codec import decode, message_type
 from share.wire.layouts import Bytes
 from share.wire.messages import Hello
 from share.wire.room_messages import ClientHello
 
 _KEPT_KEYFRAMES = 4  # of each run, the newest: one is searched in other rooms while the next ones come
 _MAX_RUNS = 1024  # of which keyframes are kept
+_KEPT_S = 60.0  # keyframes of a run that sends no more: longer than any search
 _MAX_ROUTES = 65_536  # peers whose room is remembered
 _MAX_WAIT_S = 1.0  # for the disk of the room that a run leaves; it may come back to the same place later
 
@@ -60,6 +62,14 @@ class RoomPort(Protocol):
         """Record that a run of this room may not go on in another."""
 
 
+@dataclass
+class _NewestKeyframes:
+    """Of one run. last_ns: when the newest came, monotonic."""
+
+    last_ns: int = 0
+    by_id: OrderedDict[int, Keyframe] = field(default_factory=OrderedDict)
+
+
 class RoomSwitch:
     """Routes peers to rooms. rooms: by name; the first is where those go of whom nothing is known.
     may_enter: whether the agent of a name may be in a room."""
@@ -68,7 +78,7 @@ class RoomSwitch:
         self._rooms, self._may_enter = rooms, may_enter
         self._finder = RoomFinder()
         self._routes: OrderedDict[bytes, str] = OrderedDict()  # by peer
-        self._keyframes: OrderedDict[str, OrderedDict[int, Keyframe]] = OrderedDict()  # newest, by run and id
+        self._keyframes: OrderedDict[str, _NewestKeyframes] = OrderedDict()  # by run, the newest run last
         self._waiting: dict[str, tuple[RoomFound, int]] = {}  # by run: until when, for its room's disk
         self.building = BuildingGraph()
         self.changes = 0  # of rooms, since the start
@@ -96,7 +106,7 @@ class RoomSwitch:
         first of all for other messages."""
         rooms = list(self._rooms)
         try:
-            message = decode(frames)
+            message = decode(frames) if message_type(frames) in (Hello, ClientHello) else None
         except WireError:
             return rooms[0]
         if not isinstance(message, Hello | ClientHello):
@@ -107,15 +117,25 @@ class RoomSwitch:
 
     # ------------------------------------------------------------------ searches
 
-    def add_keyframe(self, added: AddKeyframe) -> None:
+    def add_keyframe(self, added: AddKeyframe, now_ns: int) -> None:
         """Keep a keyframe that a room's mapper gets, in case other rooms are to search it."""
-        kept = self._keyframes.setdefault(added.key, OrderedDict())
+        kept = self._keyframes.setdefault(added.key, _NewestKeyframes())
         self._keyframes.move_to_end(added.key)
-        kept[added.keyframe.id] = added.keyframe
-        if len(kept) > _KEPT_KEYFRAMES:
-            kept.popitem(last=False)
+        kept.last_ns = now_ns
+        kept.by_id[added.keyframe.id] = added.keyframe
+        if len(kept.by_id) > _KEPT_KEYFRAMES:
+            kept.by_id.popitem(last=False)
         if len(self._keyframes) > _MAX_RUNS:
             self._keyframes.popitem(last=False)
+
+    def tick(self, now_ns: int) -> None:
+        """Do what time makes due: changes of rooms that wait, keyframes that nobody will search."""
+        self._move_waiting(now_ns)
+        while self._keyframes:
+            run = next(iter(self._keyframes))
+            if now_ns - self._keyframes[run].last_ns <= seconds_to_ns(_KEPT_S):
+                break
+            del self._keyframes[run]
 
     def add_ranking(self, ranking: RoomRanking, now_ns: int) -> None:
         """Have the rooms search a keyframe that look like it."""
@@ -133,15 +153,15 @@ class RoomSwitch:
         found = self._finder.add_answer(room, sought.key, sought.place, now_ns)
         if found is not None:
             self._waiting[sought.key.agent] = found, now_ns + seconds_to_ns(_MAX_WAIT_S)
-            self.move_waiting(now_ns)
+            self._move_waiting(now_ns)
 
     def _keyframe(self, run: str, id: int) -> Keyframe | None:
         kept = self._keyframes.get(run)
-        return None if kept is None else kept.get(id)
+        return None if kept is None else kept.by_id.get(id)
 
     # ------------------------------------------------------------------ changes of rooms
 
-    def move_waiting(self, now_ns: int) -> None:
+    def _move_waiting(self, now_ns: int) -> None:
         """Move the runs that are in another room, once the keyframes that theirs has are stored."""
         for run, (found, until_ns) in list(self._waiting.items()):
             if self._move(run, found) or now_ns > until_ns:

@@ -16,7 +16,7 @@ import msgspec
 
 from share.errors import VersionError, WireError, printable
 from share.wire import messages as m
-from share.wire.layouts import KEYFRAME_WITHOUT_IMAGE, LAYOUT_BY_CODE, LAYOUTS, Bytes, Header, encode_plain
+from share.wire.layouts import KEYFRAME_WITHOUT_IMAGE, LAYOUTS, MESSAGE_TYPES, Bytes, Header, encode_plain
 
 WIRE_VERSION = 8
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
@@ -63,25 +63,36 @@ def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -
 
     versions: accepted ones; stored messages may have several. Raises VersionError for others, else WireError.
     """
-    if not frames:
-        raise WireError("empty message")
-    if (header_bytes := memoryview(frames[0]).nbytes) > MAX_HEADER_BYTES:
-        raise WireError(f"header of {header_bytes} bytes, at most {MAX_HEADER_BYTES}")
-    where = "header"
+    kind = message_type(frames, versions)
     try:
-        start = _decode_version(frames[0])
-        if start.version not in versions:
-            code = start.code if isinstance(start.code, int) else None
-            raise VersionError(start.version, code, WIRE_VERSION)
         header = _decode_header(frames[0])
-        if (known := LAYOUT_BY_CODE.get(header.code)) is None:
-            raise WireError(f"unknown message type {header.code}")
-        where, layout = known
+        layout = LAYOUTS[kind]
         if header.code == KEYFRAME_WITHOUT_IMAGE.code and header.version < _IMAGE_VERSION:
             layout = KEYFRAME_WITHOUT_IMAGE
         return layout.build(**layout.decode_scalars(header.scalars), **layout.decode_arrays(header, frames))
     except _DECODE_ERRORS as error:
-        raise _wire_error(where, error) from None
+        raise _wire_error(kind.__name__, error) from None
+
+
+def message_type(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -> type[m.Message]:
+    """Return what `frames` say they are, from the start of the header alone: the rest may be invalid.
+
+    Raises as `decode`.
+    """
+    if not frames:
+        raise WireError("empty message")
+    if (header_bytes := memoryview(frames[0]).nbytes) > MAX_HEADER_BYTES:
+        raise WireError(f"header of {header_bytes} bytes, at most {MAX_HEADER_BYTES}")
+    try:
+        start = _decode_version(frames[0])
+    except _DECODE_ERRORS as error:
+        raise _wire_error("header", error) from None
+    code = start.code if isinstance(start.code, int) else None
+    if start.version not in versions:
+        raise VersionError(start.version, code, WIRE_VERSION)
+    if code is None or (kind := MESSAGE_TYPES.get(code)) is None:
+        raise WireError(f"unknown message type {printable(repr(start.code))[:40]}")
+    return kind
 
 
 def message_bytes(frames: Sequence[Bytes]) -> int:

@@ -380,7 +380,7 @@ LAYOUTS |= {  # of clients: docs/lookup/wire.md#clients
     ),
 }
 MESSAGE_CODES = {message_type: layout.code for message_type, layout in LAYOUTS.items()}
-LAYOUT_BY_CODE = {layout.code: (cls.__name__, layout) for cls, layout in LAYOUTS.items()}
+MESSAGE_TYPES = {code: message_type for message_type, code in MESSAGE_CODES.items()}
 KEYFRAME_WITHOUT_IMAGE = MessageLayout(
     3, _build_keyframe_without_image, *_KEYFRAME_ARRAYS, **_KEYFRAME_SCALARS
 )

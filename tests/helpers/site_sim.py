@@ -127,7 +127,7 @@ class Site(Town):
         elif isinstance(event, Tick):
             for room in self.rooms.values():
                 self.execute(room, room.machine.handle(event, self.now_ns))
-            self.switch.move_waiting(self.now_ns)
+            self.switch.tick(self.now_ns)
 
     def execute(self, room: SimRoom, effects: list[ed.EdgeEffect]) -> None:
         for effect in effects:
@@ -145,7 +145,7 @@ class Site(Town):
                     room.mapper.set_present(key, here)
                     self.continue_mapping(room)
                 case ed.AddKeyframe(key, keyframe, is_extra):
-                    self.switch.add_keyframe(effect)
+                    self.switch.add_keyframe(effect, self.now_ns)
                     self.continue_mapping(room, room.mapper.add_keyframe(key, keyframe, is_extra))
                 case ed.DropRun(key):
                     room.mapper.remove_run(key)

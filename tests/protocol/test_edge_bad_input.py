@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from helpers.edge_sim import Person, Town, walls
@@ -23,6 +24,7 @@ from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
+from share.wire import room_messages as r
 from share.wire.codec import decode, encode
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -69,6 +71,38 @@ def test_non_finite_numbers_are_refused_when_decoded(frame, value):
         assert not of(effects, ed.AddKeyframe)
         assert len(of(effects, ed.WriteEvent)) == (again == 0)  # said once
     assert edge.report({})["agents"]["ann"]["bad_messages"] == 3
+
+
+def broken(message: m.Message) -> list[bytes]:
+    """A message of this kind whose rest cannot be decoded."""
+    version, code, *_ = msgspec.msgpack.decode(bytes(encode(message)[0]))
+    return [msgspec.msgpack.encode((version, code, "no scalars", "no arrays"))]
+
+
+@pytest.mark.parametrize(
+    ("first", "message", "reason"),
+    [
+        (None, keyframe(0), "a message Keyframe before its hello"),
+        (None, m.Bye(), "a message Bye before its hello"),
+        (HELLO, m.Ack(1), "a message Ack, which agents must not send"),
+        (HELLO, r.Cancel(1, "tb", "ann"), "a message Cancel, which agents must not send"),
+        (r.ClientHello("ann", HELLO.run_id), keyframe(0), "a message Keyframe, which clients must not send"),
+        (r.ClientHello("ann", HELLO.run_id), HELLO, "a message Hello, which clients must not send"),
+    ],
+    ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
+)
+def test_what_a_peer_may_not_send_is_refused_before_it_is_decoded(first, message, reason):
+    edge = EdgeProtocol(Config(), 7)
+    if first is not None:
+        tell(edge, first)
+    peer_id = m.peer_id(HELLO.run_id)
+    for frames in (broken(message), [bytes(f) for f in encode(message)]):
+        effects = edge.handle(ed.PeerMessageReceived(peer_id, frames), 0)
+        assert not of(effects, ed.SendToPeer)
+    sender = edge.room.clients.get(peer_id) or edge._registry.sender(peer_id)
+    assert sender.counts["unexpected"] == 2
+    assert sender.refusals.reason == reason
+    assert sender.counts["bad_messages"] == 0
 
 
 def test_a_reused_keyframe_id_changes_nothing():

@@ -179,8 +179,18 @@ def test_a_switch_asks_nothing_of_a_run_that_has_left():
     site.to_agent(peer, ev.InputFinished())
     site.run(2000)
     before = site.switch.changes
-    site.switch.move_waiting(site.now_ns + 10**12 * MS)
+    site.switch.tick(site.now_ns + 10**12 * MS)
     assert site.switch.changes == before
+
+
+def test_keyframes_of_a_silent_run_are_kept_for_a_minute_only():
+    """Those are images of a room, whose map may have forgotten them."""
+    site = two_rooms(12)
+    (key,) = (run for run in site.switch._keyframes if run.startswith("ann-"))
+    site.switch.tick(site.now_ns + 50_000 * MS)
+    assert key in site.switch._keyframes
+    site.switch.tick(site.now_ns + 61_000 * MS)
+    assert not site.switch._keyframes
 
 
 def test_a_name_that_no_room_lets_in_has_no_room():

@@ -127,6 +127,14 @@ def test_the_examples_cover_every_message() -> None:
     assert {type(message) for message in EXAMPLES} == EVERY_CLASS == set(layouts.MESSAGE_CODES)
 
 
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: type(message).__name__)
+def test_the_start_of_the_header_says_what_a_message_is(message: m.Message) -> None:
+    header, *_ = copied(codec.encode(message))
+    version, code, *_ = msgspec.msgpack.decode(header)
+    for start in (header, msgspec.msgpack.encode((version, code, "no scalars", 7))):
+        assert codec.message_type([start]) is type(message)
+
+
 def test_codes_are_unique() -> None:
     assert len(set(layouts.MESSAGE_CODES.values())) == len(layouts.MESSAGE_CODES)
 
