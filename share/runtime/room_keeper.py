@@ -296,6 +296,7 @@ class RoomKeeper:
             return self._room.report()
         trouble = [self._failure] if self._failure else []
         report = _aged(self._last_report, time.monotonic() - self._asleep_s)
+        report.pop("loading", None)  # of a room that was never awake
         return {**report, "refused": [], "trouble": trouble, "asleep": True}
 
 

@@ -61,7 +61,7 @@ class FakeRoom:
 
     def report(self) -> dict[str, Any]:
         agents = {"ann": {"gone": True, "last_received_s": 60.0, "pose_age_ms": None}}
-        lines = {"trouble": ["the solver: died"], "refused": ["12 messages refused"]}
+        lines = {"trouble": ["the solver: died"], "refused": ["12 messages refused"], "loading": "the map"}
         return {"maps": {"ann/0": 7}, "agents": agents, **lines}
 
     def may_have_map(self, map_id: str) -> bool:
@@ -287,6 +287,7 @@ def test_a_sleeping_room_is_shown_as_it_was(bench):
     report = bench.keeper.report()
     assert report["asleep"] is True
     assert report["maps"] == {"ann/0": 7}
+    assert "loading" not in report
     assert bench.keeper.may_have_map("ann/0")
     assert report["trouble"] == report["refused"] == []
 
