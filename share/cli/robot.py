@@ -341,7 +341,8 @@ def goto(
 @_domain
 @_namespace
 @_over_wire
-def cancel(**robot_options: Any) -> None:
+@options.as_json
+def cancel(as_json: bool, **robot_options: Any) -> None:
     """Cancel the robot's goal, whoever gave it, and wait until the robot confirms that it has ended. Exit
     code 1 if it does not within 3 s (5 s, of a goal that it has not taken yet): stop it by hand.
 
@@ -349,9 +350,12 @@ def cancel(**robot_options: Any) -> None:
     Example:  share robot cancel
     """
     *_, last = (_BRIDGE_ENDED, *_reach(**robot_options).cancel())
+    if as_json:
+        click.echo(json.dumps({"stopped": last.is_reached, "text": last.text}))
+    elif last.is_reached:
+        click.echo(last.text)
     if not last.is_reached:
         raise ShareError(f"the robot's stop: {last.text}")
-    click.echo(last.text)
 
 
 @robot.command(short_help="Show the robot's position and state.")

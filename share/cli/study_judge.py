@@ -49,6 +49,7 @@ _FAR_M = 0.5  # robot by the map and by the motion capture, at the median: the f
     "[default: found by the robot's motion]",
 )
 @options.rotations
+@options.as_json
 def judge(
     folder: Path,
     trial: str,
@@ -58,6 +59,7 @@ def judge(
     up: str,
     zero: str | None,
     rotations: str,
+    as_json: bool,
 ) -> None:
     """Judge TRIAL (such as p01-2) of STUDY by a motion capture of the robot.
 
@@ -71,7 +73,7 @@ def judge(
     """
     import json
 
-    from share.files.json_file import own_format_errors, read_json_lines
+    from share.files.json_file import nan_to_none, own_format_errors, read_json_lines
     from share.files.writing import atomic_write
     from share.lab.mocap.files import pick_body, read_bodies
     from share.lab.study.mocap_judge import ClockMatch, RobotTrack, judged, match_clocks
@@ -104,13 +106,19 @@ def judge(
     if not kept.exists():
         atomic_write(kept, _content(path))
     atomic_write(path, "".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+    goals = _goals(before, read_trial(path, plan, *planned), plan, apart)
+    when = datetime.fromtimestamp(clock.zero_utc_s, UTC).isoformat(timespec="milliseconds")[:-6]
+    if as_json:
+        fields = {"events": str(path), "events_by_map": str(kept), "zero_utc": when, "goals": goals}
+        match = {"agreement": clock.agreement, "next_agreement": clock.next_agreement}
+        click.echo(json.dumps(nan_to_none(fields | match)))
+        return
     if zero is None:
-        when = datetime.fromtimestamp(clock.zero_utc_s, UTC).isoformat(timespec="milliseconds")[:-6]
         click.echo(
             f"its clock was 0 at {when} UTC (--zero for other trials of this take); driving and standing "
             f"agree to {clock.agreement:.2f}, at the next best time to {clock.next_agreement:.2f}"
         )
-    _print_goals(before, read_trial(path, plan, *planned), plan, apart)
+    click.echo(_goal_table(goals))
     click.echo(f"{path}: judged by motion capture; what the map said: {kept}")
 
 
@@ -173,27 +181,40 @@ def _floor(file: str, bodies: Mapping[str, MocapTrajectory | None], text: str, u
     return PlanarPose(x, y, math.radians(deg))
 
 
-def _print_goals(
+def _goals(
     before: TrialRecord, after: TrialRecord, plan: StudyPlan, apart: Mapping[int, float]
-) -> None:
-    """Print each goal as the map and as the motion capture have it. apart: see `_apart_m`."""
-    rows = [
-        [
-            "goal",
-            "spot",
-            "reached after, s: by the map",
-            "by motion capture",
-            "final distance, m",
-            "",
-            "apart, m",
-        ]
-    ]
+) -> list[dict[str, Any]]:
+    """Return each goal as the map and as the motion capture have it. apart: see `_apart_m`."""
+    goals = []
     for number, goal in sorted(after.goals.items()):
-        both = [one.goals[number] for one in (before, after)]
-        times = [_number(one.reached_s(plan.success), "no") for one in both]
-        distances = [_number(one.stops[-1].distance_m if one.stops else math.nan) for one in both]
-        rows.append([str(number), str(goal.spot), *times, *distances, _number(apart.get(number, math.nan))])
-    click.echo(aligned_table(rows))
+        row: dict[str, Any] = {"goal": number, "spot": goal.spot, "apart_m": apart.get(number)}
+        for judge_name, record in (("map", before), ("mocap", after)):
+            one = record.goals[number]
+            reached_s = one.reached_s(plan.success)
+            row[f"reached_s_{judge_name}"] = None if math.isnan(reached_s) else reached_s
+            row[f"distance_m_{judge_name}"] = one.stops[-1].distance_m if one.stops else None
+        goals.append(row)
+    return goals
+
+
+_COLUMNS = (
+    "goal",
+    "spot",
+    "reached after, s: by the map",
+    "by motion capture",
+    "final distance, m",
+    "",
+    "apart, m",
+)
+
+
+def _goal_table(goals: Sequence[Mapping[str, Any]]) -> str:
+    rows = [list(_COLUMNS)]
+    for one in goals:
+        times = [_number(one[name], "no") for name in ("reached_s_map", "reached_s_mocap")]
+        lengths = [_number(one[name]) for name in ("distance_m_map", "distance_m_mocap", "apart_m")]
+        rows.append([str(one["goal"]), str(one["spot"]), *times, *lengths])
+    return aligned_table(rows)
 
 
 def _apart_m(lines: Sequence[Mapping[str, Any]]) -> dict[int, float]:
@@ -215,5 +236,5 @@ def _utc_s(text: str) -> float:
         raise UsageError(f"--zero {text:.40}: is not a UTC time such as 2026-11-28T10:03:12.34") from None
 
 
-def _number(value: float, missing: str = "") -> str:
-    return missing if math.isnan(value) else f"{value:.2f}"
+def _number(value: float | None, missing: str = "") -> str:
+    return missing if value is None else f"{value:.2f}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -55,6 +56,7 @@ _SHARED_AGENTS = 12
 )
 @click.option("--table", "only_table", is_flag=True, help="Simulate nothing; print the results so far.")
 @options.out_folder
+@options.as_json
 def simulate(
     participants: int,
     goals: int,
@@ -70,6 +72,7 @@ def simulate(
     scheduler: str | None,
     only_table: bool,
     out: Path,
+    as_json: bool,
 ) -> None:
     """Carry out a study with simulated participants under the paper's four policies, in virtual time.
 
@@ -103,6 +106,11 @@ def simulate(
         if study.code != code_digest():
             print_note(str(out), "was begun by another version of the program; its trials may differ")
         _carry_out(study, workers, scheduler)
+    if as_json:
+        title, *rows = result_rows(study)
+        results = [dict(zip(title, row, strict=True)) for row in rows]
+        click.echo(json.dumps({"about": about_lines(study), "results": results, "key": str(key_path(out))}))
+        return
     for line in about_lines(study):
         click.echo(f"* {line}")
     click.echo(aligned_table(result_rows(study)))
@@ -122,7 +130,7 @@ def _carry_out(study: SimulatedStudy, processes: int, scheduler: str | None) -> 
         workers = 1 if opened is None else opened.worker_count
         total, live = len(study.missing()), LiveLine()
         about = f"about {estimated_s(study, workers) / 60:.0f} min with a core for each process"
-        click.echo(f"{total} trials to simulate, {about}; what is done stays done, so Ctrl-C is safe")
+        live.print_line(f"{total} trials to simulate, {about}; what is done stays done, so Ctrl-C is safe")
         left = TimeLeft(total)
         for number, done in enumerate(run_missing(study, workers, opened, partial(_show_stage, live)), 1):
             live.print_line(

@@ -116,6 +116,14 @@ def test_cancel_is_done_when_the_robot_confirms_it():
     assert (result.exit_code, result.stdout) == (0, "cancelled\n")
 
 
+@pytest.mark.parametrize("stops", [True, False])
+def test_cancel_for_machines(stops):
+    with Served(_confirm("text", stops)):
+        result = run("cancel", "--json")
+    assert json.loads(result.stdout) == {"stopped": stops, "text": "text"}
+    assert result.exit_code == 1 - stops
+
+
 def test_cancel_that_the_robot_does_not_confirm():
     with Served(_confirm("not confirmed by the robot: stop it by hand", False)):
         result = run("cancel")

@@ -44,6 +44,14 @@ def test_a_plan_and_its_key(study):
     assert len(read_plan(Path("s")).spots) == 10
 
 
+def test_plan_and_unblinding_for_machines(study):
+    drawn = json.loads(study("plan", "--out", "s", "--participants", 1, "--seed", 7, "--json").out)
+    assert drawn == {"seed": 7, "plan": "s/plan.json", "picture": "s/floor.png", "key": "s-key.json"}
+    policies = read_key(Path("s-key.json"), read_plan(Path("s"))).policies
+    done = study("unblind", "s", "--key", "s-key.json", "--early", "--json")
+    assert json.loads(done.out) == {"policies": policies, "trials_done": 0, "trials_planned": 4}
+
+
 @pytest.mark.parametrize("kept", ["s/plan.json", "s/floor.png", "s-key.json"])
 def test_nothing_is_overwritten(study, kept):
     planned(study)

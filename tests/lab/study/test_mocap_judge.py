@@ -178,8 +178,15 @@ def test_judging_again_begins_from_what_the_map_said(tmp_path: Path) -> None:
     path = trial_folder(folder, P01, 1) / EVENTS
     said = path.read_text()
     take = write_tum(tmp_path / "take.tum", mocap_of(1))
-    first = judge(folder, take).exit_code, path.read_text()
+    shown = judge(folder, take, "--json")
+    first = shown.exit_code, path.read_text()
     assert first[0] == 0 and path.with_name(EVENTS_BY_MAP).read_text() == said
+    goals = json.loads(shown.stdout)["goals"]
+    record = read_trials(folder, PLAN)[P01, 1]
+    for one in goals:
+        assert one["distance_m_mocap"] == record.goals[one["goal"]].stops[-1].distance_m
+        assert one["reached_s_map"] == pytest.approx(one["reached_s_mocap"], abs=0.6)
+    assert len(goals) == len(record.goals) == 2
     assert (judge(folder, take).exit_code, path.read_text()) == first
 
 

@@ -259,6 +259,8 @@ def test_a_simulated_study_from_the_command_to_its_statistics(small_cache: Path)
     assert "4 of 4 trials; simulated participants, not people" in result.output
     again = simulate(study, *options)
     assert again.exit_code == 0 and "to simulate" not in again.output
+    plain = json.loads(simulate(study, *options, "--table", "--json").stdout)
+    assert {row["policy"] for row in plain["results"]} == {"share", "covins-g", "linear", "equal"}
     key = study.with_name("study-key.json")
     analysed = CliRunner().invoke(cli, ["study", "analyze", str(study), "--key", str(key)])
     assert analysed.exit_code == 0, analysed.output
