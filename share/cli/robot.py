@@ -350,10 +350,8 @@ def cancel(as_json: bool, **robot_options: Any) -> None:
     Example:  share robot cancel
     """
     *_, last = (_BRIDGE_ENDED, *_reach(**robot_options).cancel())
-    if as_json:
-        click.echo(json.dumps({"stopped": last.is_reached, "text": last.text}))
-    elif last.is_reached:
-        click.echo(last.text)
+    if as_json or last.is_reached:
+        click.echo(json.dumps({"stopped": last.is_reached, "text": last.text}) if as_json else last.text)
     if not last.is_reached:
         raise ShareError(f"the robot's stop: {last.text}")
 

@@ -1,6 +1,6 @@
 """When a robot began to move and since when it stands, from its places a few times a second.
 
-Corrections of the map move a robot that stands by centimetres: by the map, less than MotionLimits has is no
+Corrections of the map move a robot that stands by centimetres: by the map, less than StandstillLimits has is no
 motion.
 """
 
@@ -14,7 +14,7 @@ _ROUNDING_S = 1e-6
 
 
 @dataclass(frozen=True)
-class MotionLimits:
+class StandstillLimits:
     """What is motion, and what a standstill; the defaults: of places by a map, some five a second.
 
     moved_m, turned_rad: from where it was called, beyond one of which it has begun to move. still_m,
@@ -31,8 +31,8 @@ class MotionLimits:
     max_gap_s: float = 1.5
 
 
-BY_MAP = MotionLimits()
-BY_TRUTH = MotionLimits(moved_m=0.02, turned_rad=0.05, still_m=0.005, still_rad=0.01, still_s=0.5)
+BY_MAP = StandstillLimits()
+BY_TRUTH = StandstillLimits(moved_m=0.02, turned_rad=0.05, still_m=0.005, still_rad=0.01, still_s=0.5)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class RobotSample:
 class MotionWatch:
     """Follows the robot from a call on. moves_s: its first motion; None before. path_m: driven since."""
 
-    def __init__(self, at_call: RobotSample | None, limits: MotionLimits = BY_MAP) -> None:
+    def __init__(self, at_call: RobotSample | None, limits: StandstillLimits = BY_MAP) -> None:
         self._limits = limits
         self.moves_s: float | None = None
         self.path_m = 0.0
