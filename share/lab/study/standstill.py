@@ -1,7 +1,7 @@
 """When a robot began to move and since when it stands, from its places a few times a second.
 
-Corrections of the map move a robot that stands by centimetres: by the map, less than StandstillLimits has is no
-motion.
+Corrections of the map move a robot that stands by centimetres: by the map, less than StandstillLimits has
+is no motion.
 """
 
 from __future__ import annotations
