@@ -86,10 +86,9 @@ class SiteRooms:
             for name, setup in self._setups.items():
                 room_host = _RoomHost(name, host, self)
                 serve = partial(self._serve, setup, room_host, start_ns, has_keys)
-                notify = partial(room_host.log_event, "map")
                 keep_days = setup.settings.edge.keep_days
                 keep_s = None if keep_days is None else keep_days * DAY_S
-                self._rooms[name] = RoomKeeper(setup.store, serve, notify, host.wake, idle_s, keep_s)
+                self._rooms[name] = RoomKeeper(setup.store, serve, room_host, idle_s, keep_s)
                 self._ports[name] = _Port(self._rooms[name])
         except BaseException:
             self.close()
