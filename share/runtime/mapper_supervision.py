@@ -75,9 +75,10 @@ class MapperRestarts:
         """Record that the mapper has restored the map."""
         self._is_restoring, self._tries = False, 0
 
-    def record_death(self) -> float:
-        """Record that the mapper died. Return the seconds until the next may start."""
-        self._tries += self._is_restoring
+    def record_death(self, has_run: bool = True) -> float:
+        """Record that the mapper died. Return the seconds until the next may start. has_run: its process had
+        started; else the machine lacks memory or processes, and its map is not to blame."""
+        self._tries += self._is_restoring and has_run
         return self._backoff.record_failure(time.monotonic_ns())
 
     def load_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from share.errors import ShareError, StoreError, VersionError, WireError, describe_exception
+from share.errors import StoreError, VersionError, WireError, brief_reason
 from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
@@ -228,7 +228,7 @@ class RoomKeeper:
             self._room = self._serve(store, self._totals, is_unchanged)
         except Exception as error:  # such as too many open files: the other rooms go on
             store.close()
-            self._retry_later(_reason(error))
+            self._retry_later(brief_reason(error))
             return
         self._failure, self._is_called, self._used_s = "", False, time.monotonic()
         self._expiry_s = math.inf
@@ -305,11 +305,7 @@ def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotO
             store.outline()  # which takes a while, and is kept
         return _FileOpened(store, stamp == closed_stamp)
     except Exception as error:  # such as a folder of another machine that is away
-        return _NotOpened(_reason(error))
-
-
-def _reason(error: Exception) -> str:
-    return str(error) if isinstance(error, ShareError) else describe_exception(error)
+        return _NotOpened(brief_reason(error))
 
 
 def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+import types
 from collections import deque
 from pathlib import Path
 
@@ -22,10 +23,13 @@ from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime import mapper_process, served_room
+from share.runtime.blinding import NoBlinding
 from share.runtime.edge import EdgeRun
+from share.runtime.edge_observer import EdgeObservers
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
 from share.runtime.mapper_supervision import MapperRestarts
+from share.runtime.served_room import ServedRoom
 from share.runtime.worker_process import END
 from share.store.map_store import MapStore
 from share.store.schema import PAGE_BYTES
@@ -85,7 +89,7 @@ def edge(path, monkeypatch):
         monkeypatch.setattr(mapper_process, "run_mapper", mapper)
         died = MapperRestarts.record_death
         monkeypatch.setattr(
-            MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
+            MapperRestarts, "record_death", lambda self, *a: pauses.append(died(self, *a)) or pauses[-1] / 100
         )
         pauses, events = [], []
         run = EdgeRun(Config(), Link(), None, events.append, MapStore.open(path))
@@ -337,6 +341,63 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     assert reasons(events, "map")[0] == "room: the map cannot be read: disk I/O error; retried in 0.01 s"
     session = run.report()["session"]
     until(lambda: run.report()["session"] != session)
+
+
+def serve(path, start_mapper):
+    """A room around which is nothing."""
+    host = types.SimpleNamespace(**dict.fromkeys(("wake", "send", "expect_growth", "record", "log_event")))
+    vars(host).update({name: lambda *_: None for name in vars(host)})
+    given = host, 0, MapStore.open(path), EdgeObservers(), NoBlinding(), False
+    return ServedRoom(Config(), *given, start_mapper=start_mapper)
+
+
+class Process:
+    """A mapper's process. pid: None if it could not be started."""
+
+    def __init__(self, pid):
+        self.pid = pid
+
+    def send(self, message): ...
+    def close(self): ...
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Pauses are a hundredth as long."""
+    died = MapperRestarts.record_death
+    monkeypatch.setattr(MapperRestarts, "record_death", lambda self, *args: died(self, *args) / 100)
+
+
+def test_a_mapper_that_cannot_be_started_is_tried_again(path, quick):
+    """The edge ended of too many open files when its mapper had died."""
+    errors = [None, OSError(24, "Too many open files"), RuntimeError("can't start new thread"), None]
+
+    def start(on_answer, on_death, delay_s):
+        deaths.append(on_death)
+        if (error := errors.pop(0)) is not None:
+            raise error
+        return Process(4711)
+
+    deaths: list = []
+    room = serve(path, start)
+    deaths[0]("was ended by SIGKILL")
+    room.step()
+    assert room.is_waiting
+    until(lambda: room.step() or not room.is_waiting)
+    assert not errors
+    assert room.close() is None
+
+
+@pytest.mark.parametrize("pid", [None, 4711])
+def test_a_map_is_not_to_blame_where_no_process_can_be_started(path, quick, pid):
+    """It was set aside when the machine had no memory or processes three times."""
+    deaths: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: deaths.append(on_death) or Process(pid))
+    for _ in range(6):
+        deaths[-1]("could not be started: Resource temporarily unavailable")
+        room.step()
+    room.close()
+    assert path.with_name("room.sqlite.damaged-1").exists() is (pid is not None)
 
 
 def counts(inbox, answer):
