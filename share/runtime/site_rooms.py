@@ -139,8 +139,9 @@ class SiteRooms:
 
     def step(self) -> None:
         """Handle the answers of all rooms and of the directory, and the time that has passed."""
-        for room in self._rooms.values():
-            room.step()
+        for name, room in self._rooms.items():
+            with self._guard.step(f"room '{name}'"):  # the others go on
+                room.step()
         with self._guard.step("a change of rooms"):
             self._continue_searches()
 
@@ -183,7 +184,8 @@ class SiteRooms:
         reports = {name: room.report() for name, room in self._rooms.items()}
         directory = {"keyframes": len(self._directory), "waiting": self._thread.pending_jobs}
         report = site_report(reports, self._switch.building.poses)
-        return report | {"room_changes": self._switch.changes, "directory": directory}
+        trouble = [*report["trouble"], *filter(None, [self._guard.trouble])]
+        return report | {"trouble": trouble, "room_changes": self._switch.changes, "directory": directory}
 
     # ------------------------------------------------------------------ what rooms tell
 

@@ -189,6 +189,25 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
     assert ChangesSaved(10**6) not in handled
 
 
+def test_a_mistake_costs_one_message_and_is_said(edge, monkeypatch):
+    """A message that the room could not take ended the edge."""
+    handle = ServedRoom.handle
+
+    def fails(self, event):
+        if isinstance(event, PeerMessageReceived):
+            raise KeyError("none")
+        handle(self, event)
+
+    monkeypatch.setattr(ServedRoom, "handle", fails)
+    monkeypatch.setattr(
+        Link, "receive", lambda self, timeout_ms: time.sleep(0.01) or IncomingMessage(b"1", [])
+    )
+    run, _, events = edge(dies_of_a_map)
+    until(lambda: "internal error: a message: KeyError" in " ".join(run.report().get("trouble", [])))
+    until(lambda: reasons(events, "mapper died"))  # its steps go on
+    assert len(reasons(events, "internal error")) == 1
+
+
 class Store:
     def __init__(self, load, writable=True):
         self.rows, self.writable, self.asides = load, writable, 0
