@@ -152,6 +152,18 @@ def test_the_session_that_sets_a_map_aside_knows_them(path: Path, monkeypatch: p
         assert restarts.forgotten == {ANNS_TAG: 20}
 
 
+def test_a_removed_run_is_known_by_the_copy_of_its_row_where_the_row_is_damaged(tmp_path: Path) -> None:
+    """As by a disk that fails while the edge runs: what was deleted could come back, and nothing said so."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    with MapStore.open(path) as store:
+        with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute("UPDATE run SET hello = x'ff' || substr(hello, 2) WHERE key = ?", (ANN,))
+        store.write(FORGOTTEN)
+    assert loaded(path).forgotten == {ANNS_TAG: 20}
+
+
 @pytest.mark.parametrize(("codec", "hello"), [(99, b"\x91\xc4\x00"), (8, b"\xff\xff")])
 def test_a_run_that_cannot_be_read_is_removed_all_the_same(path: Path, codec: int, hello: bytes) -> None:
     """An error would hold up the writing of all that follows."""
