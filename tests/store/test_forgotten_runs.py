@@ -121,6 +121,20 @@ def test_a_damaged_file_keeps_them(path: Path) -> None:
     assert list(kept.forgotten.items()) == list(before.forgotten.items())
 
 
+def test_it_is_said_where_they_are_lost_while_the_edge_runs(path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        (page,) = connection.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'image'").fetchone()
+    with path.open("r+b") as file:  # which the next keyframe meets
+        file.seek((page - 1) * PAGE_BYTES)
+        file.write(b"\xff" * PAGE_BYTES)
+    with MapStore.open(path) as store:
+        with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute("UPDATE about SET value = '21' WHERE name GLOB 'forgotten *'")  # but not its CRC
+        store.write([keyframe(BOB, 20)])
+        lost = "1 rows about the file, the credentials of runs and forgotten runs could not be read"
+        assert lost in store.problems
+
+
 def test_what_is_no_number_is_said(path: Path) -> None:
     with contextlib.closing(sqlite3.connect(path)) as connection, connection:
         for tag, value in (("00", "x"), ("01", "-1"), ("02", str(2**63)), ("03", None)):
