@@ -182,7 +182,7 @@ def _store_next_id(db: sqlite3.Connection, run: str, next_id: int) -> None:
 
 
 def _run_row(db: sqlite3.Connection, run: str) -> rows.Row:
-    """Return the row of a run, of both tables that have it from the one where it is intact; () without one."""
+    """Return the row of a run, from the one of its tables where it is intact; () without one."""
     select = f"SELECT number, {', '.join(COLUMNS['run'])}, crc FROM"
     copies = {table: first_row(db, f"{select} {table} WHERE key = ?", run) for table in ("run", "run_copy")}
     intact = [row for table, row in copies.items() if row and rows.is_intact(table, row[0], row[1:])]

@@ -129,7 +129,9 @@ def test_it_is_said_where_they_are_lost_while_the_edge_runs(path: Path) -> None:
         file.write(b"\xff" * PAGE_BYTES)
     with MapStore.open(path) as store:
         with contextlib.closing(sqlite3.connect(path)) as connection, connection:
-            connection.execute("UPDATE about SET value = '21' WHERE name GLOB 'forgotten *'")  # but not its CRC
+            connection.execute(
+                "UPDATE about SET value = '21' WHERE name GLOB 'forgotten *'"
+            )  # but not its CRC
         store.write([keyframe(BOB, 20)])
         lost = "1 rows about the file, the credentials of runs and forgotten runs could not be read"
         assert lost in store.problems
