@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import threading
 import time
 import types
@@ -31,6 +32,7 @@ from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
 from share.runtime.mapper_supervision import MapperRestarts
 from share.runtime.served_room import ServedRoom
 from share.runtime.worker_process import END
+from share.store import map_store
 from share.store.map_store import MapStore
 from share.store.schema import PAGE_BYTES
 from share.wire.messages import public_tag
@@ -280,6 +282,22 @@ def test_a_map_that_was_set_aside_is_a_loss():
     restarts = MapperRestarts(Store(raises(ValueError("x"))), 0.05, print)
     restarts.load_map()
     assert restarts.losses == ["the map file is renamed to m.damaged-1: ValueError: x; a new one is started"]
+
+
+def test_a_map_that_was_set_aside_is_a_loss_where_the_new_one_fails_too(path, monkeypatch):
+    """As on a full disk: the next try takes up the new one, which is empty."""
+
+    def fails(*arguments):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.05, print)
+        monkeypatch.setattr(MapStore, "rows", lambda self: raises(ValueError("x"))())
+        monkeypatch.setattr(map_store, "add_forgotten", fails)
+        with pytest.raises(StoreError):
+            restarts.load_map()
+        kept = "room.sqlite.damaged-1: see what they hold, move them away"
+        assert restarts.losses == [f"earlier files are kept as {kept}"]
 
 
 def test_a_read_only_map_is_a_loss():
