@@ -47,7 +47,9 @@ FileStamp = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _ProcessesEnded:
-    """Of a room that falls asleep."""
+    """Of a room that falls asleep. error: with which that failed; None: it did not."""
+
+    error: str | None
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,9 @@ class RoomKeeper:
     def _handle_answer(self, answer: _Answer) -> None:
         self._is_changing = False
         match answer:
-            case _ProcessesEnded() if self._closing is not None and self._path is not None:
+            case _ProcessesEnded(error) if self._closing is not None and self._path is not None:
+                if error is not None:
+                    self._host.log_event("internal error", error)
                 try:
                     self._closing.handle_answers()
                 finally:  # a file that stays open could not be opened again
@@ -277,14 +281,20 @@ class RoomKeeper:
 
 
 def _end_processes(room: ServedRoom) -> _ProcessesEnded:
-    room.end_processes()
-    return _ProcessesEnded()
+    try:
+        room.end_processes()
+    except Exception as error:  # such as no thread to be had: its file is closed all the same
+        return _ProcessesEnded(brief_reason(error))
+    return _ProcessesEnded(None)
 
 
 def _close_file(room: ServedRoom, path: Path, expires: bool) -> _FileClosed:
     """Close the map file, however long its disk takes: nobody waits for it, and a file that is given up stays
     locked. expires: keyframes that are too old are to be forgotten."""
-    incomplete_reason = room.close_file(_MAX_CLOSE_S)
+    try:
+        incomplete_reason = room.close_file(_MAX_CLOSE_S)
+    except Exception as error:  # likewise
+        incomplete_reason = brief_reason(error)
     try:
         oldest_s = oldest_arrival_s(path) if expires else math.inf
     except Exception:

@@ -43,6 +43,7 @@ class FakeRoom:
     sought: list[FindKeyframe] = field(default_factory=list)
     threads: dict[str, int] = field(default_factory=dict)  # in which each part of the end ran
     evaluations: dict[str, Any] = field(default_factory=dict)
+    reason: str | None = None
 
     def __post_init__(self) -> None:
         self.protocol = EdgeProtocol(Config(), 1)
@@ -92,6 +93,7 @@ class FakeRoom:
 
     def finish(self, incomplete_reason: str | None) -> None:
         self._note("finish")
+        self.reason = incomplete_reason
 
     def close(self) -> str | None:
         self.end_processes()
@@ -495,6 +497,21 @@ def test_series_of_who_does_not_come_back_are_kept(bench):
         assert bench.keeper.series() == before
     bench.rooms[2].evaluations = {"ann": {"t_s": [9.0], "qoe": [5.0]}, "bob": empty}
     assert bench.keeper.series() == {"ann": {"t_s": [9.0], "qoe": [5.0]}, "bob": before["bob"]}
+
+
+@pytest.mark.parametrize("part", ["end_processes", "close_file"])
+def test_an_error_of_the_thread_does_not_keep_it_asleep_for_ever(bench, part):
+    work = getattr(bench.rooms[0], part)
+
+    def fails(*arguments: Any) -> None:
+        work()
+        raise RuntimeError("can't start new thread")
+
+    setattr(bench.rooms[0], part, fails)
+    bench.step_until(is_awake=False)
+    assert "RuntimeError: can't start new thread" in "".join(map(str, (*bench.lines, bench.rooms[0].reason)))
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
 
 
 @pytest.mark.parametrize("part", ["handle_answers", "finish"])
