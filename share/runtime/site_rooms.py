@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from share.config import Config
+from share.errors import brief_reason
 from share.event_kinds import EventKind
 from share.mapping.corrections import MapEvent
 from share.mapping.forgetting import DAY_S
@@ -162,7 +163,11 @@ class SiteRooms:
         """End all processes and threads. Return which map files are incomplete and why, None if none is."""
         reasons = []
         for name, room in self._rooms.items():
-            if (reason := room.close()) is not None:
+            try:
+                reason = room.close()
+            except Exception as error:  # the others still write their files
+                reason = brief_reason(error)
+            if reason is not None:
                 reasons.append(f"room '{name}': {reason}")
         self._thread.stop(_TIMEOUT_S)
         self._spare.close()

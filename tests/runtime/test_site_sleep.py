@@ -67,7 +67,10 @@ class Room:
     def report(self) -> dict[str, Any]:
         return self.protocol.report({}) | {"trouble": [], "degraded": [], "agent_trouble": []}
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        self.is_closed = True
+        if self.settings.edge.max_agents == 1:
+            raise KeyError("another")
 
 
 def test_a_mistake_in_one_room_is_said_and_costs_the_others_nothing(monkeypatch) -> None:
@@ -86,7 +89,8 @@ def test_a_mistake_in_one_room_is_said_and_costs_the_others_nothing(monkeypatch)
     assert "room 'hall': KeyError" in host.events[0][1]
     (line,) = site.report()["trouble"]
     assert line.startswith("internal error: room 'hall': KeyError")
-    site.close()
+    assert (site.close() or "").startswith("room 'hall': KeyError: 'another'")
+    assert all(room.room.is_closed for room in site._rooms.values())
 
 
 @pytest.mark.long
