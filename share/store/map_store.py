@@ -226,7 +226,7 @@ class MapStore:
         finally:
             self._opened = self._outline = None
             self._start_writing()
-        with database.translate_errors(self.path, "written"), self._writable_db() as db:
+        with database.translate_errors(self.path, "written", writes=True), self._writable_db() as db:
             db.execute("BEGIN IMMEDIATE")
             add_forgotten(db, {**rows.read_forgotten_runs(about)[0], **forgotten})
         return renamed
