@@ -425,6 +425,19 @@ def test_a_mapper_that_cannot_be_started_is_tried_again(path, quick):
     assert room.close() is None
 
 
+def test_a_room_whose_map_is_loading_is_not_idle(path):
+    """It would fall asleep, and be shown as loading for as long."""
+    answers: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: answers.append(on_answer) or Process(4711))
+    answers[0](MapperReport({}, is_idle=True))  # while the map is on its way to the mapper
+    room.step()
+    assert not room.is_idle
+    answers[0](MapRestored())
+    room.step()
+    assert room.is_idle
+    room.close()
+
+
 @pytest.mark.parametrize("pid", [None, 4711])
 def test_a_map_is_not_to_blame_where_no_process_can_be_started(path, quick, pid):
     """It was set aside when the machine had no memory or processes three times."""
