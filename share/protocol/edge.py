@@ -131,8 +131,11 @@ class EdgeProtocol:
 
     def _on_message(self, event: ed.PeerMessageReceived) -> None:
         peer, client = self._registry.get(event.peer_id), self.room.clients.get(event.peer_id)
-        sender = client or self._registry.sender(event.peer_id)
-        if peer is not None and peer.is_gone:
+        known = client or peer
+        if known is not None and not event.is_authorised_for(known.name):
+            known = None  # a run is not to blame for who uses it with another's key
+        sender = known or self._registry.unjoined
+        if peer is not None and peer is known and peer.is_gone:
             self._registry.mark_heard(peer)
         sender.counts["bytes_up"] += message_bytes(event.frames)
         try:
@@ -145,7 +148,7 @@ class EdgeProtocol:
             self._on_other_version(event.peer_id, error)
             return
         except WireError as error:
-            self._out.count_bad_message(client or peer, str(error), throttled=client is not None)
+            self._out.count_bad_message(known, str(error), throttled=client is not None)
             return
         if peer is not None and not self._membership.may_send(event, peer, message):
             return
@@ -161,8 +164,8 @@ class EdgeProtocol:
                 self._membership.on_hello(event, message)
             case wire.Ping():
                 # a stranger may think that it has joined: whom the edge has forgotten says hello again
-                known = wire.NO_SESSION if client is None else self._session
-                session = known if peer is None else peer.session
+                session = wire.NO_SESSION if client is None else self._session
+                session = session if peer is None else peer.session
                 self._out.send(event.peer_id, wire.Pong.answering(message, self._out.now_ns, session))
             case _ if client is not None:
                 self.room.on_message(event, client, message)
