@@ -83,8 +83,7 @@ class KeyframeSought:
 
 def coarse_words(words: U32) -> U32:
     """Return the distinct words (N,) of the coarse vocabulary: one in eight of all, everywhere the same."""
-    distinct: U32 = np.unique(words)
-    chosen: U32 = distinct[(distinct * _HASH) >> np.uint32(29) == 0]
+    chosen: U32 = np.unique(words[(words * _HASH) >> np.uint32(29) == 0])
     return chosen
 
 

@@ -108,9 +108,9 @@ class _SolveResult:
 
 
 def start_mapper_process(
-    on_answer: Callable[[Any], None], on_death: Callable[[str], None], start_delay_s: float = 0.0
+    on_answer: Callable[[Any], None], on_death: Callable[[str], None], start_delay_s: float | None = 0.0
 ) -> WorkerProcess:
-    """Return a mapper's process, which takes a StartMapper first."""
+    """Return a mapper's process, which takes a StartMapper first. start_delay_s: see `WorkerProcess`."""
     return WorkerProcess("mapping", run_mapper, (), on_answer, on_death, start_delay_s)
 
 

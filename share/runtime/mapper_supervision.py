@@ -64,6 +64,11 @@ class MapperRestarts:
             lines.append(f"earlier files are kept as {_listed(earlier)}: see what they hold, move them away")
         return lines
 
+    @property
+    def is_restoring(self) -> bool:
+        """Whether the mapper has yet to restore the map."""
+        return self._is_restoring
+
     def loading(self) -> dict[str, str]:
         """Return `loading` of edge.json while the mapper restores the map, else nothing."""
         return (

@@ -41,7 +41,21 @@ _SLOW_S = 5.0  # for the disk, from which it is reported as trouble
 _TIMEOUT_S = 10.0  # for the thread at the end
 _MAX_CLOSE_S = 86_400.0  # for the disk, when a room falls asleep
 
-ServeRoom = Callable[[MapStore | None, SessionTotals, bool], ServedRoom]
+_VISIT_S = 0.0  # as `IDLE_S`, of a room that nobody has asked for
+
+
+@dataclass(frozen=True)
+class RoomStart:
+    """With what a room is served. totals: of its earlier sessions; is_unchanged: the map file is as the last
+    of them has left it; is_unused: the room falls asleep at once, so it needs no processes."""
+
+    store: MapStore | None
+    totals: SessionTotals
+    is_unchanged: bool = False
+    is_unused: bool = False
+
+
+ServeRoom = Callable[[RoomStart], ServedRoom]
 FileStamp = tuple[int, int, int]
 
 
@@ -81,9 +95,8 @@ _Answer = _ProcessesEnded | _FileClosed | _FileOpened | _NotOpened
 class RoomKeeper:
     """Serves one room, and lets it sleep, until `close`.
 
-    serve: starts the room with its opened map file, after earlier sessions with these totals, and whether the
-    file is as the last one has left it; raises StoreError. idle_s: without anybody, until it sleeps. keep_s:
-    how long keyframes are kept; None: for ever.
+    serve: raises StoreError. idle_s: without anybody, until it sleeps. keep_s: how long keyframes are kept;
+    None: for ever. begins_asleep: if it may sleep.
     """
 
     def __init__(
@@ -93,6 +106,7 @@ class RoomKeeper:
         host: RoomHost,
         idle_s: float,
         keep_s: float | None = None,
+        begins_asleep: bool = False,
     ) -> None:
         self._serve, self._host, self._idle_s, self._keep_s = serve, host, idle_s, keep_s
         self._path = store.path if store is not None and store.writable else None
@@ -103,6 +117,7 @@ class RoomKeeper:
         self._searches: deque[FindKeyframe] = deque(maxlen=_MAX_WAITING)
         self._is_changing = False  # the thread closes or opens the room
         self._is_called = False  # somebody comes
+        self._is_visit = False  # nobody has asked for it since it was woken up by `visit`
         self._failure = ""  # why the map file cannot be opened
         self._retry_s = 0.0  # monotonic, as below
         self._backoff = Backoff(time.monotonic_ns())
@@ -112,8 +127,12 @@ class RoomKeeper:
         self._expiry_s = math.inf  # when the first keyframe of a sleeping room is too old, unix s
         self._closing: ServedRoom | None = None  # as long as the thread closes it
         self._closed_stamp: FileStamp | None = None  # as in `_FileClosed`
-        self._room: ServedRoom | None = serve(store, self._totals, False)
-        self._last_protocol = self._room.protocol  # of a sleeping room: nothing changes in it
+        is_unused = begins_asleep and self._path is not None
+        room = serve(RoomStart(store, self._totals, is_unused=is_unused))
+        self._room: ServedRoom | None = room
+        self._last_protocol = room.protocol  # of a sleeping room: nothing changes in it
+        if is_unused:
+            self._fall_asleep(room)
 
     @property
     def room(self) -> ServedRoom | None:
@@ -139,12 +158,22 @@ class RoomKeeper:
 
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe in the map, as soon as the room is awake."""
-        self._used_s = time.monotonic()
+        self._used_s, self._is_visit = time.monotonic(), False
         if self._room is not None:
             self._room.find(request)
         else:
             self._searches.append(request)
             self._is_called = True
+
+    def visit(self) -> None:
+        """Wake the room up until its mapper has restored the map and has nothing to do."""
+        if self._room is None:
+            self._is_called = self._is_visit = True
+
+    @property
+    def is_visited(self) -> bool:
+        """Whether a visit is going on. One that cannot begin since the map cannot be read does not count."""
+        return self._is_visit and not self._failure
 
     def knows(self, peer_id: bytes) -> int | None:
         """As `EdgeProtocol.knows`, also of a sleeping room."""
@@ -157,9 +186,10 @@ class RoomKeeper:
             self._handle_answer(self._answers.get())
         if self._room is not None:
             self._room.step()
+            self._is_visit = self._is_visit and self._room.protocol.is_empty
             if not self._room.is_idle:
                 self._used_s = now_s
-            elif self._path is not None and now_s - self._used_s >= self._idle_s:
+            elif self._path is not None and now_s - self._used_s >= self._until_sleep_s:
                 self._fall_asleep(self._room)
         elif self._path is not None and not self._is_changing and self._is_to_wake(now_s):
             self._submit(partial(_open_map, self._path, self._closed_stamp))
@@ -187,7 +217,12 @@ class RoomKeeper:
         is_called = self._is_called or time.time() >= self._expiry_s
         return is_called and now_s >= self._retry_s
 
+    @property
+    def _until_sleep_s(self) -> float:
+        return _VISIT_S if self._is_visit else self._idle_s
+
     def _fall_asleep(self, room: ServedRoom) -> None:
+        self._is_visit = False
         self._last_protocol, self._last_series, self._last_report = (
             room.protocol,
             self.series(),
@@ -229,7 +264,7 @@ class RoomKeeper:
     def _wake_up(self, store: MapStore, is_unchanged: bool) -> None:
         since_s = time.monotonic() - _REPEATED_S
         try:
-            self._room = self._serve(store, self._totals, is_unchanged)
+            self._room = self._serve(RoomStart(store, self._totals, is_unchanged))
         except Exception as error:  # such as too many open files: the other rooms go on
             store.close()
             self._retry_later(brief_reason(error))
@@ -277,6 +312,7 @@ class RoomKeeper:
             what = "opening" if self._closing is None else "closing"
             trouble.append(f"{what} the map file has taken {took_s:.0f} s so far: nobody can enter")
         report = _aged(self._last_report, time.monotonic() - self._asleep_s)
+        report.pop("loading", None)  # of a room that was never awake
         return {**report, "refused": [], "trouble": trouble, "asleep": True}
 
 

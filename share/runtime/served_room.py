@@ -162,6 +162,7 @@ class ServedRoom:
     def finish(self, incomplete_reason: str | None) -> None:
         """Acknowledge what has been saved at the end."""
         self.handle_answers()
+        self._host.expect_growth(False)
         if incomplete_reason is not None:
             self._log_map(incomplete_reason)
 
@@ -176,8 +177,8 @@ class ServedRoom:
     def is_idle(self) -> bool:
         """Whether nobody takes part, all is in the map file, and the mapper has nothing to do."""
         is_saved = self._map_writer is not None and not self._map_writer.pending_changes
-        is_ready = not self.is_waiting and not self._restarts.loading()
-        return self._state_machine.is_empty and is_saved and self._progress.is_idle and is_ready
+        has_no_work = self._progress.is_idle and not self._restarts.is_restoring
+        return self._state_machine.is_empty and is_saved and has_no_work and not self.is_waiting
 
     @property
     def is_waiting(self) -> bool:

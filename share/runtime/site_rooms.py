@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -21,16 +22,17 @@ from share.mapping.corrections import MapEvent
 from share.mapping.forgetting import DAY_S
 from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
-from share.protocol.edge_records import SessionTotals
 from share.protocol.peer import Peer
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.fault_guard import FaultGuard
+from share.runtime.mapper_process import start_mapper_process
 from share.runtime.output_writer import JobThread
 from share.runtime.room_host import RoomHost
-from share.runtime.room_keeper import IDLE_S, RoomKeeper
+from share.runtime.room_keeper import IDLE_S, RoomKeeper, RoomStart
 from share.runtime.served_room import ServedRoom
 from share.runtime.spare_mapper import SpareMapper
+from share.runtime.worker_process import WorkerProcess
 from share.site.directory import PlaceDirectory, RoomRanking
 from share.site.report import site_report
 from share.site.room_switch import RoomPort, RoomSwitch
@@ -42,6 +44,7 @@ from share.wire.messages import Refused
 
 _NO_ROOM = "no room of this site lets this name in: add it to `agents` of one in the rooms file"
 _MAPS_S = 5.0  # period in which the building's graph forgets maps that are gone
+_MAX_VISITED = 2  # rooms at once, each a mapper that restores its map
 _TIMEOUT_S = 5.0  # for the directory's thread at the end
 
 
@@ -77,6 +80,7 @@ class SiteRooms:
         self._rankings: queue.SimpleQueue[RoomRanking] = queue.SimpleQueue()
         self._growing: set[str] = set()
         self._spare = SpareMapper()
+        self._unvisited: deque[str] = deque()  # rooms whose places the directory does not have yet
         self._maps_due_s = 0.0  # monotonic
         self._refusals = Throttle(1.0, 5.0)
         self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
@@ -89,8 +93,10 @@ class SiteRooms:
                 serve = partial(self._serve, setup, room_host, start_ns, has_keys)
                 keep_days = setup.settings.edge.keep_days
                 keep_s = None if keep_days is None else keep_days * DAY_S
-                self._rooms[name] = RoomKeeper(setup.store, serve, room_host, idle_s, keep_s)
-                self._ports[name] = _Port(self._rooms[name])
+                if setup.store is not None and setup.store.rows().tables["keyframe"]:
+                    self._unvisited.append(name)
+                keeper = RoomKeeper(setup.store, serve, room_host, idle_s, keep_s, begins_asleep=True)
+                self._rooms[name], self._ports[name] = keeper, _Port(keeper)
         except BaseException:
             self.close()
             raise
@@ -103,23 +109,20 @@ class SiteRooms:
         host: RoomHost,
         start_ns: int,
         has_keys: bool,
-        store: MapStore | None,
-        totals: SessionTotals,
-        is_unchanged: bool,
+        start: RoomStart,
     ) -> ServedRoom:
-        """Start a room. is_unchanged: the directory knows what its map file holds."""
-        neighbour = _Neighbour(setup.name, self, is_unchanged)
+        """Start a room. Where its map file is unchanged the directory knows what it holds."""
         return ServedRoom(
             setup.settings,
             host,
             start_ns,
-            store,
+            start.store,
             setup.observer,
             NoBlinding(),
             has_keys,
-            neighbour,
-            totals,
-            self._spare.take,
+            _Neighbour(setup.name, self, keeps_places=start.is_unchanged),
+            start.totals,
+            _never_started if start.is_unused else self._spare.take,
         )
 
     def handle(self, event: PeerMessageReceived) -> None:
@@ -143,8 +146,14 @@ class SiteRooms:
         for name, room in self._rooms.items():
             with self._guard.step(f"room '{name}'"):  # the others go on
                 room.step()
+        self._visit_rooms()
         with self._guard.step("a change of rooms"):
             self._continue_searches()
+
+    def _visit_rooms(self) -> None:
+        """Wake up the rooms one after the other once, so that the directory gets to know their places."""
+        while self._unvisited and sum(room.is_visited for room in self._rooms.values()) < _MAX_VISITED:
+            self._rooms[self._unvisited.popleft()].visit()
 
     def _continue_searches(self) -> None:
         while not self._rankings.empty():
@@ -219,6 +228,13 @@ class SiteRooms:
                 self._rankings.put(ranking)
         if not self._rankings.empty():
             self._host.wake()
+
+
+def _never_started(
+    on_answer: Callable[[Any], None], on_death: Callable[[str], None], start_delay_s: float
+) -> WorkerProcess:
+    """Return the mapper's process of a room that falls asleep at once."""
+    return start_mapper_process(on_answer, on_death, None)
 
 
 class _RoomHost:

@@ -24,7 +24,7 @@ class WorkerProcess:
 
     `send` never waits. `on_answer` is called with each answer, from a thread; `on_death` once, from the same
     thread, if the process ends without being asked to. start_delay_s: delay of the start; messages sent
-    meanwhile are kept.
+    meanwhile are kept. None: it is never started.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class WorkerProcess:
         arguments: tuple[Any, ...],
         on_answer: Callable[[Any], None],
         on_death: Callable[[str], None],
-        start_delay_s: float = 0.0,
+        start_delay_s: float | None = 0.0,
     ) -> None:
         self.name = name
         self._on_answer, self._on_death = on_answer, on_death
@@ -48,7 +48,7 @@ class WorkerProcess:
         self._process = SPAWN_CONTEXT.Process(
             target=_run_child, args=(self._child_end, work, arguments), name=name
         )
-        if start_delay_s <= 0.0:
+        if start_delay_s is not None and start_delay_s <= 0.0:
             self._start()
         sender = threading.Thread(target=self._send_loop, args=(start_delay_s,), daemon=True)
         self._threads = [sender, threading.Thread(target=self._receive_loop, daemon=True)]
@@ -100,8 +100,8 @@ class WorkerProcess:
             thread.join(_TIMEOUT_S)
         self._parent_end.close()
 
-    def _send_loop(self, start_delay_s: float) -> None:
-        if start_delay_s > 0.0:
+    def _send_loop(self, start_delay_s: float | None) -> None:
+        if start_delay_s is None or start_delay_s > 0.0:
             self._closing.wait(start_delay_s)
             self._start()
         while True:

@@ -49,6 +49,14 @@ _EMULATED = """
 })();
 """
 
+# At most so many frames a second are drawn: by software each costs what agents beside need.
+_SLOWER = """
+(() => {
+    const draw = window.requestAnimationFrame.bind(window);
+    window.requestAnimationFrame = (then) => setTimeout(() => draw(then), MS);
+})();
+"""
+
 # The middle of an element; null as long as it is not there, disabled, hidden or covered.
 _PUSHABLE = """(selector) => {
     const one = document.querySelector(selector);
@@ -209,9 +217,15 @@ class Browser:
             self.pages.pop().close()
 
     def page(
-        self, url: str, width: int = 960, height: int = 540, emulator: Path | None = None
+        self,
+        url: str,
+        width: int = 960,
+        height: int = 540,
+        emulator: Path | None = None,
+        max_hz: float | None = None,
     ) -> BrowserPage:
-        """Open a URL in a window of its own. emulator: that makes it a headset's browser."""
+        """Open a URL in a window of its own. emulator: that makes it a headset's browser. max_hz: frames
+        that it draws; None: as many as it can."""
         listing = f"http://127.0.0.1:{self._port}/json/version"
         with urllib.request.urlopen(listing) as answer:
             whole = _connect(json.load(answer)["webSocketDebuggerUrl"])
@@ -222,6 +236,9 @@ class Browser:
         page = BrowserPage(f"ws://127.0.0.1:{self._port}/devtools/page/{target}")
         self.pages.append(page)
         page.resize(width, height)
+        if max_hz is not None:
+            slower = _SLOWER.replace("MS", f"{1e3 / max_hz - 1e3 / 60:.1f}")
+            page.call("Page.addScriptToEvaluateOnNewDocument", source=slower)
         if emulator is not None:
             page.call("Page.addScriptToEvaluateOnNewDocument", source=emulator.read_text() + _EMULATED)
         page.open(url)

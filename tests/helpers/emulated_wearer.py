@@ -93,10 +93,15 @@ def pair(page: BrowserPage, name: str, agent: str = "", code: str = CODE) -> Non
 
 
 def wear(
-    browser: Browser, url: str, name: str, code: str = CODE, size: tuple[int, int] = (480, 240)
+    browser: Browser,
+    url: str,
+    name: str,
+    code: str = CODE,
+    size: tuple[int, int] = (480, 240),
+    max_hz: float | None = None,
 ) -> BrowserPage:
     """Open the page in an emulated headset, pair as wearer and agent `name`, and enter."""
-    page = browser.page(url, *size, emulator())
+    page = browser.page(url, *size, emulator(), max_hz)
     page.evaluate(f"(() => {{{_SCRIPT}}})()")
     pair(page, name, name, code)
     enter(page)

@@ -22,7 +22,7 @@ from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import EdgeEvent, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
 from share.runtime import room_keeper
-from share.runtime.room_keeper import RoomKeeper
+from share.runtime.room_keeper import RoomKeeper, RoomStart
 from share.store import database
 from share.store.map_store import MapStore
 from share.wire.codec import decode, encode
@@ -38,6 +38,7 @@ class FakeRoom:
     store: MapStore | None
     is_unchanged: bool
     is_idle: bool = True
+    is_unused: bool = False
     is_ended: bool = False
     handled: list[EdgeEvent] = field(default_factory=list)
     sought: list[FindKeyframe] = field(default_factory=list)
@@ -63,7 +64,7 @@ class FakeRoom:
 
     def report(self) -> dict[str, Any]:
         agents = {"ann": {"gone": True, "last_received_s": 60.0, "pose_age_ms": None}}
-        lines = {"trouble": ["the solver: died"], "refused": ["12 messages refused"]}
+        lines = {"trouble": ["the solver: died"], "refused": ["12 messages refused"], "loading": "the map"}
         return {"maps": {"ann/0": 7}, "agents": agents, **lines}
 
     def may_have_map(self, map_id: str) -> bool:
@@ -103,14 +104,20 @@ class FakeRoom:
 class Bench:
     """A keeper of fake rooms, over a real map file."""
 
-    def __init__(self, store: MapStore | None, idle_s: float = 0.0, keep_s: float | None = None) -> None:
+    def __init__(
+        self,
+        store: MapStore | None,
+        idle_s: float = 0.0,
+        keep_s: float | None = None,
+        begins_asleep: bool = False,
+    ) -> None:
         self.rooms: list[FakeRoom] = []
         self.lines: list[str] = []
         self.sent: list[tuple[bytes, Any]] = []
         self.is_failing = False
         self.woken = threading.Event()
         self.wake = self.woken.set
-        self.keeper = RoomKeeper(store, self._serve, self, idle_s, keep_s)
+        self.keeper = RoomKeeper(store, self._serve, self, idle_s, keep_s, begins_asleep)
 
     def send(self, peer_id: bytes, frames: Any) -> None:
         self.sent.append((peer_id, frames))
@@ -118,10 +125,10 @@ class Bench:
     def log_event(self, event: str, reason: str) -> None:
         self.lines.append(reason)
 
-    def _serve(self, store: MapStore | None, totals: SessionTotals, is_unchanged: bool) -> Any:
+    def _serve(self, start: RoomStart) -> Any:
         if self.is_failing:
             raise StoreError("it cannot be read")
-        self.rooms.append(FakeRoom(store, is_unchanged))
+        self.rooms.append(FakeRoom(start.store, start.is_unchanged, is_unused=start.is_unused))
         return self.rooms[-1]
 
     def step_until(self, is_awake: bool) -> None:
@@ -291,6 +298,7 @@ def test_a_sleeping_room_is_shown_as_it_was(bench):
     report = bench.keeper.report()
     assert report["asleep"] is True
     assert report["maps"] == {"ann/0": 7}
+    assert "loading" not in report
     assert bench.keeper.may_have_map("ann/0")
     assert report["trouble"] == report["refused"] == []
 
@@ -302,6 +310,54 @@ def test_the_ages_of_a_sleeping_room_grow(bench):
     second = bench.keeper.report()["agents"]["ann"]
     assert 60.0 <= first["last_received_s"] < second["last_received_s"] - 0.09
     assert second["pose_age_ms"] is None
+
+
+def test_a_room_may_begin_asleep(tmp_path):
+    path = tmp_path / "room.sqlite"
+    bench = Bench(MapStore.open(path), idle_s=3600.0, begins_asleep=True)
+    assert bench.rooms[0].is_unused
+    bench.step_until(is_awake=False)
+    assert not is_locked(path)
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    assert not bench.rooms[1].is_unused
+    bench.keeper.step()
+    assert bench.is_awake
+    bench.keeper.close()
+
+
+@pytest.mark.parametrize("who_comes", ["nobody", "an agent", "a search"])
+def test_a_room_that_is_visited_sleeps_again_as_soon_as_it_is_idle(tmp_path, who_comes):
+    bench = Bench(MapStore.open(tmp_path / "room.sqlite"), idle_s=3600.0, begins_asleep=True)
+    bench.step_until(is_awake=False)
+    bench.keeper.visit()
+    assert bench.keeper.is_visited
+    bench.step_until(is_awake=True)
+    bench.rooms[1].is_idle = False
+    bench.keeper.step()
+    assert bench.is_awake
+    assert bench.keeper.is_visited
+    if who_comes == "an agent":
+        bench.keeper.handle(hello())
+    elif who_comes == "a search":
+        bench.keeper.find(request())
+    bench.keeper.step()
+    bench.rooms[1].is_idle = True
+    bench.keeper.step()
+    assert not bench.keeper.is_visited
+    assert (bench.keeper.room is None) is (who_comes == "nobody")
+    bench.keeper.close()
+
+
+def test_a_visit_that_waits_for_a_file_does_not_count(tmp_path):
+    """Others need not wait for it."""
+    bench = Bench(MapStore.open(tmp_path / "room.sqlite"), begins_asleep=True)
+    bench.step_until(is_awake=False)
+    bench.is_failing = True
+    bench.keeper.visit()
+    line_of(bench)
+    assert not bench.keeper.is_visited
+    bench.keeper.close()
 
 
 def line_of(bench: Bench) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from helpers.hellos import hello_of
-from helpers.map_changes import pose, small_map
+from helpers.map_changes import keyframe, pose, run, small_map
 from helpers.map_files import is_locked
 
 from share.config import Config, EdgeConfig
@@ -93,23 +93,39 @@ def test_a_mistake_in_one_room_is_said_and_costs_the_others_nothing(monkeypatch)
     assert all(room.room.is_closed for room in site._rooms.values())
 
 
+def one_run(room: str) -> list[Any]:
+    key = f"{room}-0003"
+    return [run(key), *(keyframe(key, i, first=i == 0) for i in range(20))]
+
+
 @pytest.mark.long
 def test_rooms_sleep_and_a_run_that_returns_goes_on_in_its_room(tmp_path: Path) -> None:
     host = Host()
-    setups = [setup_of(tmp_path, "hall", []), setup_of(tmp_path, "lab", small_map())]
-    site = SiteRooms(host, setups, time.monotonic_ns(), False, idle_s=0.0)
+    setups = [
+        setup_of(tmp_path, "hall", []),
+        setup_of(tmp_path, "lab", small_map()),
+        *(setup_of(tmp_path, name, one_run(name)) for name in ("kitchen", "attic")),
+    ]
+    site = SiteRooms(host, setups, time.monotonic_ns(), False)
+    most_awake = 0
 
     def step_until(condition: Any) -> dict[str, Any]:
         deadline = time.monotonic() + 60.0
         while not condition(report := site.report()):
-            assert time.monotonic() < deadline, report["rooms"]
+            assert time.monotonic() < deadline, (report["directory"], report["rooms"])
             time.sleep(0.01)
             site.step()
+            nonlocal most_awake
+            most_awake = max(most_awake, sum(room.room is not None for room in site._rooms.values()))
         return report
 
-    asleep = step_until(lambda now: all("asleep" in room for room in now["rooms"].values()))
+    def are_asleep(now: dict[str, Any]) -> bool:
+        return all("asleep" in room for room in now["rooms"].values())
+
+    assert are_asleep(site.report())  # from the beginning
+    asleep = step_until(lambda now: now["directory"]["keyframes"] == 80 and are_asleep(now))
     assert asleep["rooms"]["lab"]["keyframes"] == 40
-    assert asleep["directory"]["keyframes"] == 40
+    assert most_awake == 2
     step_until(lambda now: not any(map(is_locked, tmp_path.glob("*.sqlite"))))
 
     ann = hello_of("ann", 1, T=pose(3))
@@ -120,7 +136,7 @@ def test_rooms_sleep_and_a_run_that_returns_goes_on_in_its_room(tmp_path: Path) 
     assert "asleep" not in awake["rooms"]["lab"]
     assert awake["rooms"]["hall"]["asleep"]
     again = step_until(lambda now: now["rooms"]["lab"]["keyframes"] == 40 and not now.get("loading"))
-    assert again["directory"]["keyframes"] == 40
+    assert again["directory"]["keyframes"] == 80
     assert again["agents"]["ann"]["room"] == "lab"
     assert site.close() is None
     assert not [one for one in host.events if one[0] in ("mapper died", "internal error")]
