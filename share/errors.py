@@ -70,6 +70,11 @@ def describe_exception(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}{where}"
 
 
+def brief_reason(error: Exception) -> str:
+    """Return the line of a ShareError, of any other exception `describe_exception`."""
+    return str(error) if isinstance(error, ShareError) else describe_exception(error)
+
+
 def install_hint(packages: str, extra: str) -> str:
     """Return a line on how to install missing `packages` by an extra of SHARE; not possible in a frozen
     program."""

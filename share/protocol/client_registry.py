@@ -19,7 +19,6 @@ _NEW_RUN_LIMIT = (8.0, 2.0)  # at once, and a second, of a name
 _REQUEST_LIMIT, _COMMAND_LIMIT, _STATE_LIMIT = (80.0, 40.0), (20.0, 10.0), (40.0, 20.0)  # of a name
 _FULL_RATE_NAMES = 3  # of more names that ask at a time about objects, each has a smaller part of their rate
 _MAX_REQUESTS, _MAX_COMMANDS = 64, 16  # of a client that are remembered
-_MAX_REMOVED = 256  # clients that are remembered
 _ANSWERED_S = 0.6  # a bridge that was silent for longer may be dead
 
 Downlink = Welcome | Refused | Pong | ClientDownlink | ClientUplink
@@ -89,7 +88,6 @@ class ClientRegistry:
     def __init__(self, out: EdgeOutput, silent_s: float) -> None:
         self._out, self._silent_s = out, silent_s
         self._clients: dict[bytes, Client] = {}
-        self._removed: dict[bytes, None] = {}  # by `send_away`, the oldest first
         self._new_runs = TokenBuckets(*_NEW_RUN_LIMIT)
         self.requests, self.commands = TokenBuckets(*_REQUEST_LIMIT), TokenBuckets(*_COMMAND_LIMIT)
         self.states = TokenBuckets(*_STATE_LIMIT)
@@ -150,7 +148,6 @@ class ClientRegistry:
             return f"too many new clients of '{hello.name}': try again in a second"
         client = Client(id=event.peer_id, hello=hello, last_received_ns=now_ns)
         self._clients[event.peer_id] = client
-        self._removed.pop(event.peer_id, None)
         what = "bridge of a robot" if hello.drives_robot else "client"
         self._out.record("client joined", None, f"{what}, '{hello.name}'", client=hello.name)
         return client
@@ -159,23 +156,12 @@ class ClientRegistry:
         if self._clients.pop(client.id, None) is not None:
             self._out.record("client left", None, f"'{client.name}': {reason}", client=client.name)
 
-    def send_away(self, client: Client, reason: str) -> None:
-        """Remove a client that may think that it is still served."""
-        self.leave(client, reason)
-        self._removed[client.id] = None
-        if len(self._removed) > _MAX_REMOVED:
-            del self._removed[next(iter(self._removed))]
-
     def remove_silent(self) -> None:
         """Remove the clients that have been silent too long."""
         limit_ns = self._out.now_ns - seconds_to_ns(self._silent_s)
         for client in self:
             if client.last_received_ns < limit_ns:
-                self.send_away(client, f"no message for {self._silent_s:g} s")
-
-    def was_removed(self, peer_id: bytes) -> bool:
-        """Return whether a client was sent away. It may think that it is still served."""
-        return peer_id in self._removed
+                self.leave(client, f"no message for {self._silent_s:g} s")
 
 
 def permission_objection(name: str, permission: Permission, event: PeerMessageReceived) -> str | None:

@@ -81,7 +81,7 @@ class ClientService:
         """Let the clients of an agent that goes on in another room say hello there."""
         for client in self.clients:
             if client.name == name:
-                self.clients.send_away(client, reason)
+                self.clients.leave(client, reason)
 
     def tick(self) -> None:
         """Do what time makes due."""

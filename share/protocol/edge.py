@@ -34,7 +34,6 @@ from share.wire import messages as wire
 from share.wire.codec import decode, message_bytes, message_type
 from share.wire.room_messages import ClientHello
 
-_NO_SESSION = 0  # in a pong to a client or a run that the edge has forgotten: it says hello again
 _VERSION_REFUSAL_HZ = 0.5  # refusals a second of a peer of another wire version, at most
 
 _BEFORE_HELLO: frozenset[type] = frozenset((wire.Hello, ClientHello, wire.Ping))  # what any peer may send
@@ -132,8 +131,11 @@ class EdgeProtocol:
 
     def _on_message(self, event: ed.PeerMessageReceived) -> None:
         peer, client = self._registry.get(event.peer_id), self.room.clients.get(event.peer_id)
-        sender = client or self._registry.sender(event.peer_id)
-        if peer is not None and peer.is_gone:
+        known = client or peer
+        if known is not None and not event.is_authorised_for(known.name):
+            known = None  # a run is not to blame for who uses it with another's key
+        sender = known or self._registry.unjoined
+        if peer is not None and peer is known and peer.is_gone:
             self._registry.mark_heard(peer)
         sender.counts["bytes_up"] += message_bytes(event.frames)
         try:
@@ -146,7 +148,7 @@ class EdgeProtocol:
             self._on_other_version(event.peer_id, error)
             return
         except WireError as error:
-            self._out.count_bad_message(client or peer, str(error), throttled=client is not None)
+            self._out.count_bad_message(known, str(error), throttled=client is not None)
             return
         if peer is not None and not self._membership.may_send(event, peer, message):
             return
@@ -160,12 +162,11 @@ class EdgeProtocol:
                 self.room.on_hello(event, message)
             case wire.Hello():
                 self._membership.on_hello(event, message)
-            case wire.Ping():  # of an unjoined peer too: the session tells it to send a hello
-                times = message.sent_ns, self._out.now_ns, self._out.now_ns
-                session = self._session if peer is None else peer.session
-                if self._has_forgotten(event.peer_id):
-                    session = _NO_SESSION
-                self._out.send(event.peer_id, wire.Pong(message.sequence, *times, session))
+            case wire.Ping():
+                # a stranger may think that it has joined: whom the edge has forgotten says hello again
+                session = wire.NO_SESSION if client is None else self._session
+                session = session if peer is None else peer.session
+                self._out.send(event.peer_id, wire.Pong.answering(message, self._out.now_ns, session))
             case _ if client is not None:
                 self.room.on_message(event, client, message)
             case wire.Bye() if peer:
@@ -183,9 +184,6 @@ class EdgeProtocol:
         else:
             allowed, objection = _BEFORE_HELLO, " before its hello"
         return None if kind in allowed else f"a message {kind.__name__}{objection}"
-
-    def _has_forgotten(self, peer_id: bytes) -> bool:
-        return self.room.clients.was_removed(peer_id) or self._registry.forgotten(peer_id) is not None
 
     def _on_agent_message(self, peer: Peer, message: wire.Message) -> None:
         """Handle a message of a joined agent."""

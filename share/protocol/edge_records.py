@@ -230,7 +230,7 @@ def _add_counts(
     out = dict(now)
     for *outer, name in paths:
         before = previous.get(outer[0], {}) if outer else previous
-        if before.get(name):
+        if name in before:
             counts = out
             if outer:
                 counts = out[outer[0]] = dict(out.get(outer[0], {}))

@@ -131,11 +131,13 @@ class EdgeRun:
             has_news = True
             names = self._link.agent_names(message.key)
             may = self._allowed if names is None else self._link.permissions(message.key)
-            self._room.handle(PeerMessageReceived(message.peer, message.frames, names, message.key, may))
+            with self._guard.step("a message"):
+                self._room.handle(PeerMessageReceived(message.peer, message.frames, names, message.key, may))
         for line in self._link.refusals():
             self._count_refusal(line)
         self._log_write_failures()
-        self._room.step()
+        with self._guard.step("a step of the room"):
+            self._room.step()
         if time.monotonic() >= self._report_due_s:
             self._try_to_report()
         self._show_state(time.monotonic(), has_news)
@@ -151,10 +153,11 @@ class EdgeRun:
         self._report_due_s = now + _REPORT_S
         self._heap.trim_if_due(now)
         report = self._room.report()
+        troubles = self._guard.trouble, self._files.trouble, self._link.trouble()
         self._report = {
             **report,
             "refused_handshakes": self._refused_handshakes.total(),
-            "trouble": [*report["trouble"], *filter(None, (self._files.trouble, self._link.trouble()))],
+            "trouble": [*report["trouble"], *filter(None, troubles)],
             "uptime_s": round((time.monotonic_ns() - self._start_ns) * 1e-9, 3),
         }
         self._reported_s = now

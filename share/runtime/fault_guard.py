@@ -12,6 +12,7 @@ from share.errors import ShareError
 from share.timing import LineLimiter
 
 _MAX_TEXT = 160  # characters of an error
+_SHOWN_S = 10.0  # how long a failed step is shown as trouble
 
 
 class FaultGuard:
@@ -20,6 +21,7 @@ class FaultGuard:
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self.failure_count = 0
+        self._newest, self._newest_s = "", 0.0  # failure, and its time, monotonic
         self._notify = notify
         self._lines, self._lock = LineLimiter(), threading.Lock()
 
@@ -36,6 +38,12 @@ class FaultGuard:
         except Exception as error:
             self.record(what, error)
 
+    @property
+    def trouble(self) -> str | None:
+        """The newest failure, while it is recent; None without one."""
+        is_recent = bool(self._newest) and time.monotonic() - self._newest_s < _SHOWN_S
+        return f"internal error: {self._newest}" if is_recent else None
+
     def record(self, what: str, error: Exception) -> None:
         frame_summary = traceback.extract_tb(error.__traceback__)[-1]
         kind = (
@@ -45,6 +53,7 @@ class FaultGuard:
         text = f"{kind}: {str(error)[:_MAX_TEXT]}; this step is skipped and the run goes on"
         with self._lock:
             self.failure_count += 1
+            self._newest, self._newest_s = kind, time.monotonic()
             line = self._lines.admit_new(text, time.monotonic_ns(), kind)
         if line is not None:
             self._notify(line)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from share.errors import ShareError
@@ -41,7 +42,7 @@ class MapperRestarts:
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring, self._restored_keyframes = False, 0
         self._tries = 0
-        self._copies = [] if store is None else [copy.name for copy in damaged_copies(store.path)]
+        self._copies = [] if store is None else _copy_names(store.path)
         self._asides: list[str] = []  # a line each
 
     @property
@@ -80,9 +81,10 @@ class MapperRestarts:
         """Record that the mapper has restored the map."""
         self._is_restoring, self._tries = False, 0
 
-    def record_death(self) -> float:
-        """Record that the mapper died. Return the seconds until the next may start."""
-        self._tries += self._is_restoring
+    def record_death(self, has_run: bool = True) -> float:
+        """Record that the mapper died. Return the seconds until the next may start. has_run: its process had
+        started; else the machine lacks memory or processes, and its map is not to blame."""
+        self._tries += self._is_restoring and has_run
         return self._backoff.record_failure(time.monotonic_ns())
 
     def load_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
@@ -116,7 +118,10 @@ class MapperRestarts:
             self.store = None
             text = f"the map file is no longer used: {reason}; nothing is saved"
         else:
-            renamed = self.store.set_aside(self.forgotten or {})
+            try:
+                renamed = self.store.set_aside(self.forgotten or {})
+            finally:  # it may be renamed, and the new one still fail
+                self._copies = _copy_names(self.store.path)
             self.forgotten = self.store.outline().forgotten  # of the file too, which may not have been read
             text = f"the map file is renamed to {renamed.name}: {reason}; a new one is started"
         self._asides.append(text)
@@ -153,6 +158,10 @@ class MapperProgress:
         if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:
             return f"the solver has worked on one solution for {solving_s:.0f} s: no corrections meanwhile"
         return None
+
+
+def _copy_names(path: Path) -> list[str]:
+    return [copy.name for copy in damaged_copies(path)]
 
 
 def _listed(names: list[str]) -> str:

@@ -19,22 +19,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from share.errors import ShareError, StoreError, VersionError, WireError, describe_exception
+from share.errors import StoreError, VersionError, WireError, brief_reason
 from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
 from share.protocol.versions import refusal_of_version
 from share.runtime.output_writer import JobThread
+from share.runtime.room_host import RoomHost
 from share.runtime.served_room import ServedRoom
 from share.store.map_store import MapStore, oldest_arrival_s
 from share.timing import Backoff
-from share.wire.codec import message_type
-from share.wire.messages import Hello
+from share.wire.codec import decode, encode, message_type
+from share.wire.messages import NO_SESSION, Hello, Ping, Pong
 from share.wire.room_messages import ClientHello
 
 IDLE_S = 60.0  # without anybody, after which a room falls asleep
 _MAX_WAITING = 64  # messages, and keyframes to search, that wait until the room is awake
+_REPEATED_S = 1.0  # after which all repeat what waits, hellos and pings, but those who have gone
+_SLOW_S = 5.0  # for the disk, from which it is reported as trouble
 _TIMEOUT_S = 10.0  # for the thread at the end
 _MAX_CLOSE_S = 86_400.0  # for the disk, when a room falls asleep
 
@@ -58,15 +61,19 @@ FileStamp = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _ProcessesEnded:
-    """Of a room that falls asleep."""
+    """Of a room that falls asleep. error: with which that failed; None: it did not."""
+
+    error: str | None
 
 
 @dataclass(frozen=True)
 class _FileClosed:
-    """oldest_s: when the oldest keyframe in the file arrived, unix s; infinity where all are kept."""
+    """oldest_s: when the oldest keyframe in the file arrived, unix s; infinity where all are kept. stamp: of
+    the file as the room has left it."""
 
     incomplete_reason: str | None
     oldest_s: float
+    stamp: FileStamp | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,28 +95,25 @@ _Answer = _ProcessesEnded | _FileClosed | _FileOpened | _NotOpened
 class RoomKeeper:
     """Serves one room, and lets it sleep, until `close`.
 
-    serve: raises StoreError. notify: takes a line for the event log. wake: has `step` called soon; safe from
-    any thread. idle_s: without anybody, until it sleeps. keep_s: how long keyframes are kept; None: for ever.
-    begins_asleep: if it may sleep.
+    serve: raises StoreError. idle_s: without anybody, until it sleeps. keep_s: how long keyframes are kept;
+    None: for ever. begins_asleep: if it may sleep.
     """
 
     def __init__(
         self,
         store: MapStore | None,
         serve: ServeRoom,
-        notify: Callable[[str], None],
-        wake: Callable[[], None],
+        host: RoomHost,
         idle_s: float,
         keep_s: float | None = None,
         begins_asleep: bool = False,
     ) -> None:
-        self._serve, self._notify, self._wake_loop, self._idle_s = serve, notify, wake, idle_s
-        self._keep_s = keep_s
+        self._serve, self._host, self._idle_s, self._keep_s = serve, host, idle_s, keep_s
         self._path = store.path if store is not None and store.writable else None
         self._totals = SessionTotals()
         self._thread = JobThread("room")
         self._answers: queue.SimpleQueue[_Answer] = queue.SimpleQueue()
-        self._messages: deque[PeerMessageReceived] = deque(maxlen=_MAX_WAITING)
+        self._messages: deque[tuple[float, PeerMessageReceived]] = deque(maxlen=_MAX_WAITING)
         self._searches: deque[FindKeyframe] = deque(maxlen=_MAX_WAITING)
         self._is_changing = False  # the thread closes or opens the room
         self._is_called = False  # somebody comes
@@ -122,7 +126,7 @@ class RoomKeeper:
         self._used_s = self._asleep_s = time.monotonic()  # last used, fallen asleep
         self._expiry_s = math.inf  # when the first keyframe of a sleeping room is too old, unix s
         self._closing: ServedRoom | None = None  # as long as the thread closes it
-        self._closed_stamp: FileStamp | None = None  # of the map file as the room has left it
+        self._closed_stamp: FileStamp | None = None  # as in `_FileClosed`
         is_unused = begins_asleep and self._path is not None
         room = serve(RoomStart(store, self._totals, is_unused=is_unused))
         self._room: ServedRoom | None = room
@@ -142,12 +146,15 @@ class RoomKeeper:
 
     def handle(self, event: PeerMessageReceived) -> None:
         """Handle a message; a sleeping room keeps it and wakes up, if it comes from somebody that it knows or
-        says hello."""
+        says hello. It answers the ping of a stranger."""
         if self._room is not None:
             self._room.handle(event)
         elif self.knows(event.peer_id) is not None or _is_hello(event):
-            self._messages.append(event)
+            self._messages.append((time.monotonic(), event))
             self._is_called = True
+        elif (ping := _ping_of(event)) is not None:
+            pong = Pong.answering(ping, time.monotonic_ns(), NO_SESSION)
+            self._host.send(event.peer_id, encode(pong))
 
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe in the map, as soon as the room is awake."""
@@ -218,7 +225,7 @@ class RoomKeeper:
         self._is_visit = False
         self._last_protocol, self._last_series, self._last_report = (
             room.protocol,
-            room.series(),
+            self.series(),
             room.report(),
         )
         self._totals, self._asleep_s = room.end_totals(), time.monotonic()
@@ -231,40 +238,44 @@ class RoomKeeper:
 
         def run() -> None:
             self._answers.put(job())
-            self._wake_loop()
+            self._host.wake()
 
         self._thread.submit(run)
 
     def _handle_answer(self, answer: _Answer) -> None:
         self._is_changing = False
         match answer:
-            case _ProcessesEnded() if self._closing is not None:
-                self._closing.handle_answers()
-                self._submit(
-                    partial(_close_file, self._closing, None if self._keep_s is None else self._path)
-                )
-            case _FileClosed(incomplete_reason, oldest_s) if self._closing is not None:
-                self._closing.finish(incomplete_reason)
+            case _ProcessesEnded(error) if self._closing is not None and self._path is not None:
+                if error is not None:
+                    self._host.log_event("internal error", error)
+                try:
+                    self._closing.handle_answers()
+                finally:  # a file that stays open could not be opened again
+                    self._submit(partial(_close_file, self._closing, self._path, self._keep_s is not None))
+            case _FileClosed(incomplete_reason, oldest_s, stamp) if (closed := self._closing) is not None:
                 self._expiry_s = oldest_s + (self._keep_s or 0.0)
-                self._closing, self._closed_stamp = None, _file_stamp(self._path)
+                self._closing, self._closed_stamp = None, stamp
+                closed.finish(incomplete_reason)
             case _FileOpened(store, is_unchanged):
                 self._wake_up(store, is_unchanged)
             case _NotOpened(reason):
                 self._retry_later(reason)
 
     def _wake_up(self, store: MapStore, is_unchanged: bool) -> None:
+        since_s = time.monotonic() - _REPEATED_S
         try:
             self._room = self._serve(RoomStart(store, self._totals, is_unchanged))
         except Exception as error:  # such as too many open files: the other rooms go on
             store.close()
-            self._retry_later(_reason(error))
+            self._retry_later(brief_reason(error))
             return
         self._failure, self._is_called, self._used_s = "", False, time.monotonic()
         self._expiry_s = math.inf
         for request in self._searches:
             self._room.find(request)
-        for event in self._messages:
-            self._room.handle(event)
+        for received_s, event in self._messages:
+            if received_s >= since_s:  # else its sender has gone, and would keep others of its name out
+                self._room.handle(event)
         self._searches.clear()
         self._messages.clear()
 
@@ -273,7 +284,7 @@ class RoomKeeper:
         pause_s = self._backoff.record_failure(time.monotonic_ns())
         self._retry_s = time.monotonic() + pause_s
         if reason != self._failure:
-            self._notify(f"{reason}; retried every {pause_s:g} s and more")
+            self._host.log_event("map", f"{reason}; retried every {pause_s:g} s and more")
         self._failure = reason
 
     # ------------------------------------------------------------------ what is shown
@@ -287,33 +298,44 @@ class RoomKeeper:
         return self._room is None or self._room.may_have_map(map_id)
 
     def series(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return `series` of edge.json; of a sleeping room, as it was."""
-        return self._last_series if self._room is None else {**self._last_series, **self._room.series()}
+        """Return `series` of edge.json; of a sleeping room, and of who has not come back, as it was."""
+        series = {} if self._room is None else self._room.series()
+        new = {name: one for name, one in series.items() if any(one.values())}
+        return {**series, **self._last_series, **new}
 
     def report(self) -> dict[str, Any]:
         """Return edge.json of the room; of a sleeping one as it was, with `asleep`."""
         if self._room is not None:
             return self._room.report()
         trouble = [self._failure] if self._failure else []
+        if (took_s := self._thread.busy_s) >= _SLOW_S:
+            what = "opening" if self._closing is None else "closing"
+            trouble.append(f"{what} the map file has taken {took_s:.0f} s so far: nobody can enter")
         report = _aged(self._last_report, time.monotonic() - self._asleep_s)
         report.pop("loading", None)  # of a room that was never awake
         return {**report, "refused": [], "trouble": trouble, "asleep": True}
 
 
 def _end_processes(room: ServedRoom) -> _ProcessesEnded:
-    room.end_processes()
-    return _ProcessesEnded()
-
-
-def _close_file(room: ServedRoom, path: Path | None) -> _FileClosed:
-    """Close the map file, however long its disk takes: nobody waits for it, and a file that is given up stays
-    locked. path: where keyframes that are too old are to be forgotten."""
-    incomplete_reason = room.close_file(_MAX_CLOSE_S)
     try:
-        oldest_s = math.inf if path is None else oldest_arrival_s(path)
+        room.end_processes()
+    except Exception as error:  # such as no thread to be had: its file is closed all the same
+        return _ProcessesEnded(brief_reason(error))
+    return _ProcessesEnded(None)
+
+
+def _close_file(room: ServedRoom, path: Path, expires: bool) -> _FileClosed:
+    """Close the map file, however long its disk takes: nobody waits for it, and a file that is given up stays
+    locked. expires: keyframes that are too old are to be forgotten."""
+    try:
+        incomplete_reason = room.close_file(_MAX_CLOSE_S)
+    except Exception as error:  # likewise
+        incomplete_reason = brief_reason(error)
+    try:
+        oldest_s = oldest_arrival_s(path) if expires else math.inf
     except Exception:
         oldest_s = -math.inf  # said when the file is opened, which is due now
-    return _FileClosed(incomplete_reason, oldest_s)
+    return _FileClosed(incomplete_reason, oldest_s, _file_stamp(path))
 
 
 def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotOpened:
@@ -329,11 +351,7 @@ def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotO
             store.outline()  # which takes a while, and is kept
         return _FileOpened(store, stamp == closed_stamp)
     except Exception as error:  # such as a folder of another machine that is away
-        return _NotOpened(_reason(error))
-
-
-def _reason(error: Exception) -> str:
-    return str(error) if isinstance(error, ShareError) else describe_exception(error)
+        return _NotOpened(brief_reason(error))
 
 
 def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:
@@ -352,10 +370,8 @@ def _increased(fields: Mapping[str, Any], **more: float) -> dict[str, Any]:
     return {**fields, **older}
 
 
-def _file_stamp(path: Path | None) -> FileStamp | None:
+def _file_stamp(path: Path) -> FileStamp | None:
     """Return inode, size and time of the last change; None if there is no such file."""
-    if path is None:
-        return None
     try:
         status = path.stat()
     except OSError:
@@ -370,3 +386,11 @@ def _is_hello(event: PeerMessageReceived) -> bool:
         return refusal_of_version(error) is not None
     except WireError:
         return False
+
+
+def _ping_of(event: PeerMessageReceived) -> Ping | None:
+    try:
+        message = decode(event.frames) if message_type(event.frames) is Ping else None
+    except WireError:
+        return None
+    return message if isinstance(message, Ping) else None

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from share.config import Config
-from share.errors import StoreError
+from share.errors import ShareError, StoreError, brief_reason
 from share.mapping.places import FindKeyframe, KeyframeSought
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
@@ -286,7 +286,8 @@ class ServedRoom:
 
     def _restart_mapping(self, reason: str) -> None:
         """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
-        pause_s = self._restarts.record_death()
+        has_run = self._mapper_process is not None and self._mapper_process.pid is not None
+        pause_s = self._restarts.record_death(has_run)
         text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
         self._host.log_event("mapper died", text)
         self._troubles.add(f"the mapper: {text}", pause_s + TROUBLE_SHOWN_S)
@@ -302,9 +303,11 @@ class ServedRoom:
             self.end_totals()
             self._start_session(loaded, pause_s)
             self._restart_due_s = None
-        except StoreError as error:  # until it can be read, nothing is applied or acknowledged
-            self._log_map(f"{error}; retried in {pause_s:g} s")
-            self._restart_due_s, self._restart_reason = time.monotonic() + pause_s, str(error)
+        except (ShareError, OSError, RuntimeError) as error:  # the disk; too many open files, or threads
+            # until the map can be read and a process started, nothing is applied or acknowledged
+            self._restart_reason = brief_reason(error)
+            self._log_map(f"{self._restart_reason}; retried in {pause_s:g} s")
+            self._restart_due_s = time.monotonic() + pause_s
 
     # ------------------------------------------------------------------ answers and effects
 

@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 from share.config import Config
+from share.errors import brief_reason
 from share.event_kinds import EventKind
 from share.mapping.corrections import MapEvent
 from share.mapping.forgetting import DAY_S
@@ -90,12 +91,11 @@ class SiteRooms:
             for name, setup in self._setups.items():
                 room_host = _RoomHost(name, host, self)
                 serve = partial(self._serve, setup, room_host, start_ns, has_keys)
-                notify = partial(room_host.log_event, "map")
                 keep_days = setup.settings.edge.keep_days
                 keep_s = None if keep_days is None else keep_days * DAY_S
                 if setup.store is not None and setup.store.rows().tables["keyframe"]:
                     self._unvisited.append(name)
-                keeper = RoomKeeper(setup.store, serve, notify, host.wake, idle_s, keep_s, begins_asleep=True)
+                keeper = RoomKeeper(setup.store, serve, room_host, idle_s, keep_s, begins_asleep=True)
                 self._rooms[name], self._ports[name] = keeper, _Port(keeper)
         except BaseException:
             self.close()
@@ -143,8 +143,9 @@ class SiteRooms:
 
     def step(self) -> None:
         """Handle the answers of all rooms and of the directory, and the time that has passed."""
-        for room in self._rooms.values():
-            room.step()
+        for name, room in self._rooms.items():
+            with self._guard.step(f"room '{name}'"):  # the others go on
+                room.step()
         self._visit_rooms()
         with self._guard.step("a change of rooms"):
             self._continue_searches()
@@ -171,7 +172,11 @@ class SiteRooms:
         """End all processes and threads. Return which map files are incomplete and why, None if none is."""
         reasons = []
         for name, room in self._rooms.items():
-            if (reason := room.close()) is not None:
+            try:
+                reason = room.close()
+            except Exception as error:  # the others still write their files
+                reason = brief_reason(error)
+            if reason is not None:
                 reasons.append(f"room '{name}': {reason}")
         self._thread.stop(_TIMEOUT_S)
         self._spare.close()
@@ -193,7 +198,8 @@ class SiteRooms:
         reports = {name: room.report() for name, room in self._rooms.items()}
         directory = {"keyframes": len(self._directory), "waiting": self._thread.pending_jobs}
         report = site_report(reports, self._switch.building.poses)
-        return report | {"room_changes": self._switch.changes, "directory": directory}
+        trouble = [*report["trouble"], *filter(None, [self._guard.trouble])]
+        return report | {"trouble": trouble, "room_changes": self._switch.changes, "directory": directory}
 
     # ------------------------------------------------------------------ what rooms tell
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -44,18 +44,25 @@ def site_report(
         "clients": [
             {**client, "room": room} for room, report in reports.items() for client in report["clients"]
         ],
-        "unjoined": dict(sum((Counter(report["unjoined"]) for report in reports.values()), Counter())),
+        "unjoined": _sum(report["unjoined"] for report in reports.values()),
         **{name: {key: one for report in reports.values() for key, one in report.get(name, {}).items()}
            for name in _BY_NAME},
         **{name: [f"room '{room}': {line}" for room, report in reports.items() for line in report[name]]
            for name in _LINES},
         **{name: sum(report.get(name, 0) for report in reports.values()) for name in _COUNTS},
-        **{name: dict(sum((Counter(report.get(name, {})) for report in reports.values()), Counter()))
-           for name in ("loops", "merges")},
+        **{name: _sum(report.get(name, {}) for report in reports.values()) for name in ("loops", "merges")},
         **({"loading": "; ".join(loading)} if loading else {}),
         "version": first["version"],
         "config": first["config"],
     }  # fmt: skip
+
+
+def _sum(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Return the sum of counts by name; unlike that of Counters it has zeros too."""
+    total = Counter[str]()
+    for one in counts:
+        total.update(one)
+    return dict(total)
 
 
 def _place(room: str, maps: Mapping[str, int], poses: Mapping[RoomMap, BuildingPose]) -> dict[str, Any]:

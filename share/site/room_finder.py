@@ -21,7 +21,7 @@ _STANDS_OUT = (
     1.3  # factor by which a room looks more like a keyframe than the room that does not recognise it
 )
 _CLEARLY_MORE = 2.0  # times the inliers of the second room; fewer: the rooms look alike
-_ANSWER_S = 1.0  # within which rooms answer; one that does not has not found it
+_ANSWER_S = 1.0  # within which all rooms answer; else a later keyframe is searched
 _PAUSE_S = 1.0  # after a search in vain, unless a room looks much more like it than those that were asked
 _MAX_RUNS = 10_000  # remembered
 

@@ -93,10 +93,9 @@ class RoomSwitch:
         known = {
             name: count for name, one in self._rooms.items() if (count := one.knows(peer_id)) is not None
         }
-        room = max(known, key=lambda name: known[name]) if known else self._room_for_new(frames)
-        if room is None:
-            return None
-        self._routes[peer_id] = room
+        if not known:  # and not remembered either: strangers may be many
+            return self._room_for_new(frames)
+        self._routes[peer_id] = room = max(known, key=lambda name: known[name])
         if len(self._routes) > _MAX_ROUTES:
             self._routes.popitem(last=False)
         return room

@@ -144,7 +144,7 @@ def _remove_keyframe(db: sqlite3.Connection, key: KeyframeKey) -> None:
 
 def _delete_run(db: sqlite3.Connection, run: str) -> None:
     """Remove a run with its name; where keyframes of it were removed, it stays known by its tag."""
-    row = first_row(db, "SELECT key, next, codec, hello FROM run WHERE key = ?", run)
+    row = _run_row(db, run)
     if row and (next_id := _next_id(db, run)):
         with contextlib.suppress(ValueError, WireError, StoreError):  # of another version: it has no tag here
             add_forgotten(db, {public_tag(rows.read_run(row).hello.run_id): next_id})
@@ -174,10 +174,19 @@ def _take_forgotten(db: sqlite3.Connection, tag: str) -> int:
 
 
 def _store_next_id(db: sqlite3.Connection, run: str, next_id: int) -> None:
+    _, _, codec, hello = _run_row(db, run)
     for table in ("run", "run_copy"):
-        number, codec, hello = first_row(db, f"SELECT number, codec, hello FROM {table} WHERE key = ?", run)
+        (number,) = first_row(db, f"SELECT number FROM {table} WHERE key = ?", run)
         db.execute(f"DELETE FROM {table} WHERE number = ?", (number,))
         insert(db, table, (run, next_id, codec, hello), number)
+
+
+def _run_row(db: sqlite3.Connection, run: str) -> rows.Row:
+    """Return the row of a run, from the one of its tables where it is intact; () without one."""
+    select = f"SELECT number, {', '.join(COLUMNS['run'])}, crc FROM"
+    copies = {table: first_row(db, f"{select} {table} WHERE key = ?", run) for table in ("run", "run_copy")}
+    intact = [row for table, row in copies.items() if row and rows.is_intact(table, row[0], row[1:])]
+    return next(iter(intact), copies["run"])[1:-1]
 
 
 def _delete_row(db: sqlite3.Connection, table: str, key: KeyframeKey) -> None:

@@ -81,14 +81,15 @@ def limit_time(connection: sqlite3.Connection, path: Path) -> sqlite3.Connection
 
 
 @contextlib.contextmanager
-def translate_errors(path: Path, action: str) -> Iterator[None]:
-    """Turn SQLite's errors in the block into DamageError if the file is damaged, else StoreError."""
+def translate_errors(path: Path, action: str, writes: bool = False) -> Iterator[None]:
+    """Turn SQLite's errors in the block into DamageError if the file is damaged, else StoreError. writes: the
+    block writes, so that a full disk is told from a broken one."""
     try:
         yield
     except DAMAGE_ERRORS as error:
         if is_damage(error):
             raise DamageError(f"{path}: the map is damaged: {error}") from None
-        why = size_limit_message(error, path) or error
+        why = why_not_written(error, path) if writes else size_limit_message(error, path) or error
         raise StoreError(f"{path}: the map cannot be {action}: {why}") from None
 
 
@@ -158,7 +159,7 @@ def is_map(path: Path) -> bool:
         return False
 
 
-def why_not_written(error: sqlite3.Error, path: Path) -> str:
+def why_not_written(error: Exception, path: Path) -> str:
     """Return why a write failed. SQLite reports a quota and a broken disk alike, so a test file is
     written."""
     if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:

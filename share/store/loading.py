@@ -83,7 +83,7 @@ def _opened(read_rows: ReadRows) -> OpenedMap:
 def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
     """Open the writer's connection to a file that `read_and_repair` has checked; create or convert its
     tables. now_s: unix s, see `convert`."""
-    with translate_errors(path, "opened"):
+    with translate_errors(path, "opened", writes=True):
         connection = database.open_for_writing(path, durable)
         connection.execute("BEGIN IMMEDIATE")
         if schema.is_empty(connection):

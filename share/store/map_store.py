@@ -169,8 +169,8 @@ class MapStore:
         """Salvage the file. Not all of it is read when it is opened, so it may be damaged unnoticed."""
         self._writable_db().close()
         try:
-            renamed = salvage(self.path)[1]
-            self.problems = (*self.problems, damage_text(renamed))
+            salvaged, renamed = salvage(self.path)
+            self.problems = (*self.problems, damage_text(renamed), *decode_map(salvaged).problems)
         finally:
             self._opened = self._outline = None
             self._start_writing()
@@ -226,7 +226,7 @@ class MapStore:
         finally:
             self._opened = self._outline = None
             self._start_writing()
-        with database.translate_errors(self.path, "written"), self._writable_db() as db:
+        with database.translate_errors(self.path, "written", writes=True), self._writable_db() as db:
             db.execute("BEGIN IMMEDIATE")
             add_forgotten(db, {**rows.read_forgotten_runs(about)[0], **forgotten})
         return renamed

@@ -78,7 +78,7 @@ def salvage(path: Path) -> tuple[ReadRows, Path]:
     part = path.with_name(path.name + ".salvaged.part")
     part.unlink(missing_ok=True)
     database.create_private(part)
-    with database.translate_errors(part, "written"), write_errors(part):
+    with database.translate_errors(part, "written", writes=True), write_errors(part):
         _write_rows(read_rows, part)
         part.replace(_salvaged_path(path))
     return read_rows, finish_salvage(path)

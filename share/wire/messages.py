@@ -239,12 +239,16 @@ class Rate:
             raise ValueError(f"jpeg_quality: {self.jpeg_quality} is outside 1 .. 100")
 
 
+NO_SESSION = 0  # of no edge
+
+
 @dataclass(frozen=True)
 class Pong:
     """Answer to a ping, with the four stamps of RFC 5905, section 8: `sent_ns` by the agent's clock, the
     others by the edge's.
 
-    Every ping is answered, also of an unjoined peer: by `session` it sees that it has to send a hello again.
+    Every ping is answered, also of an unjoined peer: by `session`, NO_SESSION, it sees that it has to send a
+    hello again.
     """
 
     sequence: int
@@ -252,6 +256,11 @@ class Pong:
     received_ns: int
     replied_ns: int
     session: int
+
+    @classmethod
+    def answering(cls, ping: Ping, now_ns: int, session: int) -> Pong:
+        """now_ns: the edge's clock."""
+        return cls(ping.sequence, ping.sent_ns, now_ns, now_ns, session)
 
     def __post_init__(self) -> None:
         for name in ("sent_ns", "received_ns", "replied_ns"):

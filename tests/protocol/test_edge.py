@@ -21,6 +21,7 @@ from share.mapping.graph.solver import PoseGraphSolver
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Refusal, Verification
 from share.mapping.steps import QueryStep, SolveStep, VerifyStep
+from share.protocol import admission
 from share.protocol import agent_events as ev
 from share.protocol import edge_events as ed
 from share.protocol.common_events import PrintLine, Tick
@@ -251,9 +252,24 @@ def test_max_agents_is_kept():
 def test_unjoined_peers_get_a_pong_and_nothing_else():
     edge = EdgeProtocol(Config(), 7)
     pong = sent(tell(edge, 5, m.Ping(3, 42), 9), m.Pong)
-    assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, 7)]
+    assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, m.NO_SESSION)]  # of session 7 it knows nothing yet
     assert not sent(tell(edge, 5, m.Evaluation(0, 1.0, None)), m.Message)
     assert edge.report({})["unjoined"]["unexpected"] == 1
+
+
+def test_a_run_that_was_forgotten_before_its_first_keyframe_says_hello_again(monkeypatch):
+    """By a pong of the session that it knows it would send on, and be refused everything, for ever."""
+    monkeypatch.setattr(admission, "_MAX_IDLE", 1)
+    edge = EdgeProtocol(Config(), 7)
+    tell(edge, 1, hello("ann", 1))
+    edge.handle(Tick(), 5000 * MS)  # she is silent
+    tell(edge, 2, hello("bob", 2), 5000)
+    assert "ann" not in edge.report({})["agents"]
+    (pong,) = sent(tell(edge, 1, m.Ping(1, 1), 5001), m.Pong)
+    assert pong.session == m.NO_SESSION
+    (welcome,) = sent(tell(edge, 1, hello("ann", 1), 5002), m.Welcome)
+    (pong,) = sent(tell(edge, 1, m.Ping(2, 1), 5003), m.Pong)
+    assert pong.session == welcome.session == 7
 
 
 def test_malformed_messages_are_counted_and_recorded_once():

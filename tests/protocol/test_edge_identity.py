@@ -52,6 +52,20 @@ def of(effects: list[ed.EdgeEffect], kind: type) -> list:
     return [effect for effect in effects if isinstance(effect, kind)]
 
 
+def test_a_run_is_not_to_blame_for_who_uses_it_with_another_s_key() -> None:
+    """The page said of ann that her messages are refused."""
+    edge = EdgeProtocol(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), ANN)
+    before = edge.report({})["agents"]["ann"]
+    for message in (m.Welcome(1, 0), m.Bye(), keyframe(0)):
+        tell(edge, message, EVE)
+    edge.handle(ed.PeerMessageReceived(m.peer_id(SECRET), [b"nonsense"], EVE), 0)
+    report = edge.report({})
+    assert report["agents"]["ann"] == before
+    assert report["unjoined"]["unexpected"] == 1
+    assert report["unjoined"]["bad_messages"] == 3
+
+
 def test_a_key_is_authorised_for_its_names_only() -> None:
     edge = EdgeProtocol(Config(), 7)
     (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))

@@ -6,6 +6,7 @@ from typing import Any
 
 from helpers.hellos import hello_of
 
+from share.cli.edge_output import run_summary
 from share.config import Config
 from share.mapping.mapper import Mapper
 from share.protocol.edge import EdgeProtocol
@@ -66,7 +67,8 @@ def test_earlier_counts_are_reported_before_the_next_mapper_reports() -> None:
     totals.add_session(totals.with_totals(before))
     silent = EdgeProtocol(Config(), 2).report({})
     added = totals.with_totals(silent)
-    assert (added["loops"], added["solve_ms"]) == ({"tried": 5}, {"n": 5})
+    assert (added["loops"], added["solve_ms"]) == ({"tried": 5, "accepted": 0}, {"n": 5})
+    assert "loops: 5 tried, 0 accepted; 0 merges" in run_summary(added)  # it ended in a KeyError
     assert b"share_edge_loops_tried_total" not in edge_metrics.render_metrics(added)[0]  # of no agent
     assert added["agents"] == {}
 

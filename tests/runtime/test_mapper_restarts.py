@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import threading
 import time
+import types
 from collections import deque
 from pathlib import Path
 
@@ -22,11 +24,15 @@ from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
 from share.runtime import edge as edge_module
 from share.runtime import mapper_process, served_room
+from share.runtime.blinding import NoBlinding
 from share.runtime.edge import EdgeRun
+from share.runtime.edge_observer import EdgeObservers
 from share.runtime.map_writer import MapWriter
 from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
 from share.runtime.mapper_supervision import MapperRestarts
+from share.runtime.served_room import ServedRoom
 from share.runtime.worker_process import END
+from share.store import map_store
 from share.store.map_store import MapStore
 from share.store.schema import PAGE_BYTES
 from share.wire.messages import public_tag
@@ -85,7 +91,7 @@ def edge(path, monkeypatch):
         monkeypatch.setattr(mapper_process, "run_mapper", mapper)
         died = MapperRestarts.record_death
         monkeypatch.setattr(
-            MapperRestarts, "record_death", lambda self: pauses.append(died(self)) or pauses[-1] / 100
+            MapperRestarts, "record_death", lambda self, *a: pauses.append(died(self, *a)) or pauses[-1] / 100
         )
         pauses, events = [], []
         run = EdgeRun(Config(), Link(), None, events.append, MapStore.open(path))
@@ -185,6 +191,25 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
     assert ChangesSaved(10**6) not in handled
 
 
+def test_a_mistake_costs_one_message_and_is_said(edge, monkeypatch):
+    """A message that the room could not take ended the edge."""
+    handle = ServedRoom.handle
+
+    def fails(self, event):
+        if isinstance(event, PeerMessageReceived):
+            raise KeyError("none")
+        handle(self, event)
+
+    monkeypatch.setattr(ServedRoom, "handle", fails)
+    monkeypatch.setattr(
+        Link, "receive", lambda self, timeout_ms: time.sleep(0.01) or IncomingMessage(b"1", [])
+    )
+    run, _, events = edge(dies_of_a_map)
+    until(lambda: "internal error: a message: KeyError" in " ".join(run.report().get("trouble", [])))
+    until(lambda: reasons(events, "mapper died"))  # its steps go on
+    assert len(reasons(events, "internal error")) == 1
+
+
 class Store:
     def __init__(self, load, writable=True):
         self.rows, self.writable, self.asides = load, writable, 0
@@ -257,6 +282,22 @@ def test_a_map_that_was_set_aside_is_a_loss():
     restarts = MapperRestarts(Store(raises(ValueError("x"))), 0.05, print)
     restarts.load_map()
     assert restarts.losses == ["the map file is renamed to m.damaged-1: ValueError: x; a new one is started"]
+
+
+def test_a_map_that_was_set_aside_is_a_loss_where_the_new_one_fails_too(path, monkeypatch):
+    """As on a full disk: the next try takes up the new one, which is empty."""
+
+    def fails(*arguments):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.05, print)
+        monkeypatch.setattr(MapStore, "rows", lambda self: raises(ValueError("x"))())
+        monkeypatch.setattr(map_store, "add_forgotten", fails)
+        with pytest.raises(StoreError):
+            restarts.load_map()
+        kept = "room.sqlite.damaged-1: see what they hold, move them away"
+        assert restarts.losses == [f"earlier files are kept as {kept}"]
 
 
 def test_a_read_only_map_is_a_loss():
@@ -337,6 +378,76 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     assert reasons(events, "map")[0] == "room: the map cannot be read: disk I/O error; retried in 0.01 s"
     session = run.report()["session"]
     until(lambda: run.report()["session"] != session)
+
+
+def serve(path, start_mapper):
+    """A room around which is nothing."""
+    host = types.SimpleNamespace(**dict.fromkeys(("wake", "send", "expect_growth", "record", "log_event")))
+    vars(host).update({name: lambda *_: None for name in vars(host)})
+    given = host, 0, MapStore.open(path), EdgeObservers(), NoBlinding(), False
+    return ServedRoom(Config(), *given, start_mapper=start_mapper)
+
+
+class Process:
+    """A mapper's process. pid: None if it could not be started."""
+
+    def __init__(self, pid):
+        self.pid = pid
+
+    def send(self, message): ...
+    def close(self): ...
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Pauses are a hundredth as long."""
+    died = MapperRestarts.record_death
+    monkeypatch.setattr(MapperRestarts, "record_death", lambda self, *args: died(self, *args) / 100)
+
+
+def test_a_mapper_that_cannot_be_started_is_tried_again(path, quick):
+    """The edge ended of too many open files when its mapper had died."""
+    errors = [None, OSError(24, "Too many open files"), RuntimeError("can't start new thread"), None]
+
+    def start(on_answer, on_death, delay_s):
+        deaths.append(on_death)
+        if (error := errors.pop(0)) is not None:
+            raise error
+        return Process(4711)
+
+    deaths: list = []
+    room = serve(path, start)
+    deaths[0]("was ended by SIGKILL")
+    room.step()
+    assert room.is_waiting
+    until(lambda: room.step() or not room.is_waiting)
+    assert not errors
+    assert room.close() is None
+
+
+def test_a_room_whose_map_is_loading_is_not_idle(path):
+    """It would fall asleep, and be shown as loading for as long."""
+    answers: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: answers.append(on_answer) or Process(4711))
+    answers[0](MapperReport({}, is_idle=True))  # while the map is on its way to the mapper
+    room.step()
+    assert not room.is_idle
+    answers[0](MapRestored())
+    room.step()
+    assert room.is_idle
+    room.close()
+
+
+@pytest.mark.parametrize("pid", [None, 4711])
+def test_a_map_is_not_to_blame_where_no_process_can_be_started(path, quick, pid):
+    """It was set aside when the machine had no memory or processes three times."""
+    deaths: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: deaths.append(on_death) or Process(pid))
+    for _ in range(6):
+        deaths[-1]("could not be started: Resource temporarily unavailable")
+        room.step()
+    room.close()
+    assert path.with_name("room.sqlite.damaged-1").exists() is (pid is not None)
 
 
 def counts(inbox, answer):

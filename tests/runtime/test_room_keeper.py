@@ -21,11 +21,12 @@ from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import EdgeEvent, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
+from share.runtime import room_keeper
 from share.runtime.room_keeper import RoomKeeper, RoomStart
 from share.store import database
 from share.store.map_store import MapStore
-from share.wire.codec import encode
-from share.wire.messages import Ping, peer_id
+from share.wire.codec import decode, encode
+from share.wire.messages import NO_SESSION, Ping, Pong, peer_id
 
 ANN, BOB = hello_of("ann", 1), hello_of("bob", 2)
 
@@ -42,6 +43,8 @@ class FakeRoom:
     handled: list[EdgeEvent] = field(default_factory=list)
     sought: list[FindKeyframe] = field(default_factory=list)
     threads: dict[str, int] = field(default_factory=dict)  # in which each part of the end ran
+    evaluations: dict[str, Any] = field(default_factory=dict)
+    reason: str | None = None
 
     def __post_init__(self) -> None:
         self.protocol = EdgeProtocol(Config(), 1)
@@ -68,7 +71,7 @@ class FakeRoom:
         return False
 
     def series(self) -> dict[str, Any]:
-        return {}
+        return self.evaluations
 
     def end_totals(self) -> SessionTotals:
         return SessionTotals()
@@ -91,6 +94,7 @@ class FakeRoom:
 
     def finish(self, incomplete_reason: str | None) -> None:
         self._note("finish")
+        self.reason = incomplete_reason
 
     def close(self) -> str | None:
         self.end_processes()
@@ -109,11 +113,17 @@ class Bench:
     ) -> None:
         self.rooms: list[FakeRoom] = []
         self.lines: list[str] = []
+        self.sent: list[tuple[bytes, Any]] = []
         self.is_failing = False
         self.woken = threading.Event()
-        self.keeper = RoomKeeper(
-            store, self._serve, self.lines.append, self.woken.set, idle_s, keep_s, begins_asleep
-        )
+        self.wake = self.woken.set
+        self.keeper = RoomKeeper(store, self._serve, self, idle_s, keep_s, begins_asleep)
+
+    def send(self, peer_id: bytes, frames: Any) -> None:
+        self.sent.append((peer_id, frames))
+
+    def log_event(self, event: str, reason: str) -> None:
+        self.lines.append(reason)
 
     def _serve(self, start: RoomStart) -> Any:
         if self.is_failing:
@@ -138,7 +148,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path):
+def bench(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(room_keeper, "_REPEATED_S", 60.0)  # however slow the machine is
     bench = Bench(MapStore.open(tmp_path / "room.sqlite"))
     yield bench
     bench.keeper.close()
@@ -461,3 +472,114 @@ def test_it_ends_well_in_every_state(tmp_path):
             bench.keeper.step()
         assert bench.keeper.close() is None
         assert not is_locked(tmp_path / f"{steps}.sqlite")
+
+
+def test_a_stranger_s_ping_is_answered_by_a_sleeping_room(bench):
+    """Else `share doctor` says that there is no edge, and a client that was away too long says no hello."""
+    bench.step_until(is_awake=False)
+    bench.keeper.handle(ping(BOB))
+    bench.keeper.step()
+    assert bench.is_awake is False
+    ((peer, frames),) = bench.sent
+    pong = decode([bytes(f) for f in frames])
+    assert peer == peer_id(BOB.run_id)
+    assert isinstance(pong, Pong)
+    assert (pong.sequence, pong.sent_ns, pong.session) == (1, 1, NO_SESSION)
+
+
+def test_who_has_gone_before_it_woke_up_does_not_come_in(bench, monkeypatch):
+    """They would be present, and keep those of their names out who have started again meanwhile."""
+    bench.step_until(is_awake=False)
+    bench.is_failing = True
+    monkeypatch.setattr(room_keeper, "_REPEATED_S", 0.2)
+    bench.keeper.handle(hello(BOB))
+    assert line_of(bench)
+    time.sleep(0.3)
+    bench.is_failing = False
+    while bench.is_awake is not True:  # not more than can wait
+        if not bench.keeper._messages or bench.keeper._messages[-1][0] < time.monotonic() - 0.1:
+            bench.keeper.handle(hello(ANN))
+        bench.keeper.step()
+        time.sleep(0.005)
+    assert {event.peer_id for event in bench.rooms[1].handled} == {peer_id(ANN.run_id)}
+
+
+@pytest.mark.parametrize("is_waking", [False, True])
+def test_a_disk_that_hangs_is_said_while_a_room_falls_asleep_or_wakes_up(bench, monkeypatch, is_waking):
+    """Nobody can enter meanwhile."""
+    monkeypatch.setattr(room_keeper, "_SLOW_S", 0.1)
+    answers = threading.Event()
+    opened, close = MapStore.open, bench.rooms[0].close_file
+    if is_waking:
+        bench.step_until(is_awake=False)
+        monkeypatch.setattr(MapStore, "open", lambda path: answers.wait(20.0) and opened(path))
+    else:
+        bench.rooms[0].close_file = lambda timeout_s: answers.wait(20.0) and close(timeout_s)
+        bench.keeper.step()
+    bench.keeper.handle(hello())
+    deadline = time.monotonic() + 20.0
+    while not bench.keeper.report()["trouble"]:
+        assert time.monotonic() < deadline
+        bench.keeper.step()
+        time.sleep(0.005)
+    assert "the map file has taken 0 s so far" in bench.keeper.report()["trouble"][0]
+    answers.set()
+    bench.step_until(is_awake=True)
+    assert bench.keeper.report()["trouble"] == ["the solver: died"]
+
+
+def test_only_the_thread_looks_at_the_disk(bench, monkeypatch):
+    threads, stamp_of = [], room_keeper._file_stamp
+    monkeypatch.setattr(
+        room_keeper, "_file_stamp", lambda path: threads.append(threading.get_ident()) or stamp_of(path)
+    )
+    bench.step_until(is_awake=False)
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    assert len(threads) == 2
+    assert threading.get_ident() not in threads
+
+
+def test_series_of_who_does_not_come_back_are_kept(bench):
+    empty = {"t_s": [], "qoe": []}
+    bench.rooms[0].evaluations = {"ann": {"t_s": [1.0], "qoe": [3.0]}, "bob": {"t_s": [2.0], "qoe": [4.0]}}
+    before = dict(bench.keeper.series())
+    for number in (1, 2):
+        bench.step_until(is_awake=False)
+        assert bench.keeper.series() == before
+        bench.keeper.handle(hello())
+        bench.step_until(is_awake=True)
+        bench.rooms[number].evaluations = {"ann": empty, "bob": empty}  # as of all runs in the file
+        assert bench.keeper.series() == before
+    bench.rooms[2].evaluations = {"ann": {"t_s": [9.0], "qoe": [5.0]}, "bob": empty}
+    assert bench.keeper.series() == {"ann": {"t_s": [9.0], "qoe": [5.0]}, "bob": before["bob"]}
+
+
+@pytest.mark.parametrize("part", ["end_processes", "close_file"])
+def test_an_error_of_the_thread_does_not_keep_it_asleep_for_ever(bench, part):
+    work = getattr(bench.rooms[0], part)
+
+    def fails(*arguments: Any) -> None:
+        work()
+        raise RuntimeError("can't start new thread")
+
+    setattr(bench.rooms[0], part, fails)
+    bench.step_until(is_awake=False)
+    assert "RuntimeError: can't start new thread" in "".join(map(str, (*bench.lines, bench.rooms[0].reason)))
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+
+
+@pytest.mark.parametrize("part", ["handle_answers", "finish"])
+def test_an_error_while_it_falls_asleep_does_not_keep_the_file(bench, tmp_path, part):
+    def fails(*arguments: Any) -> None:
+        raise RuntimeError("a mistake")
+
+    setattr(bench.rooms[0], part, fails)
+    bench.keeper.step()
+    with pytest.raises(RuntimeError):
+        bench.step_until(is_awake=False)
+    bench.step_until(is_awake=False)
+    assert not is_locked(tmp_path / "room.sqlite")
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)

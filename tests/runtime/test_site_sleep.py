@@ -11,8 +11,10 @@ from helpers.hellos import hello_of
 from helpers.map_changes import keyframe, pose, run, small_map
 from helpers.map_files import is_locked
 
-from share.config import Config
+from share.config import Config, EdgeConfig
+from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
+from share.runtime import site_rooms
 from share.runtime.edge_observer import EdgeObservers
 from share.runtime.site_rooms import RoomSetup, SiteRooms
 from share.store.map_store import MapStore
@@ -45,6 +47,50 @@ def setup_of(folder: Path, name: str, changes: list[Any]) -> RoomSetup:
     store = MapStore.open(folder / f"{name}.sqlite")
     store.write(changes)
     return RoomSetup(name, Config(), store, EdgeObservers())
+
+
+class Room:
+    """Stands for a `ServedRoom`. name: by the policy of its settings."""
+
+    is_idle, protocol = False, EdgeProtocol(Config(), 7)
+
+    def __init__(self, settings: Config, *_: Any) -> None:
+        self.settings, self.steps = settings, 0
+
+    def handle(self, event: PeerMessageReceived) -> None: ...
+
+    def step(self) -> None:
+        self.steps += 1
+        if self.settings.edge.max_agents == 1:
+            raise KeyError("a mistake")
+
+    def report(self) -> dict[str, Any]:
+        return self.protocol.report({}) | {"trouble": [], "degraded": [], "agent_trouble": []}
+
+    def close(self) -> None:
+        self.is_closed = True
+        if self.settings.edge.max_agents == 1:
+            raise KeyError("another")
+
+
+def test_a_mistake_in_one_room_is_said_and_costs_the_others_nothing(monkeypatch) -> None:
+    """It ended the site, or the steps of all rooms after it."""
+    monkeypatch.setattr(site_rooms, "ServedRoom", Room)
+    host, faulty = Host(), Config(edge=EdgeConfig(max_agents=1))
+    setups = [
+        RoomSetup(name, config, None, EdgeObservers())
+        for name, config in {"hall": faulty, "lab": Config()}.items()
+    ]
+    site = SiteRooms(host, setups, time.monotonic_ns(), False)
+    for _ in range(3):
+        site.step()
+    assert [room.room.steps for room in site._rooms.values()] == [3, 3]
+    assert [kind for kind, _ in host.events] == ["internal error"]
+    assert "room 'hall': KeyError" in host.events[0][1]
+    (line,) = site.report()["trouble"]
+    assert line.startswith("internal error: room 'hall': KeyError")
+    assert (site.close() or "").startswith("room 'hall': KeyError: 'another'")
+    assert all(room.room.is_closed for room in site._rooms.values())
 
 
 def one_run(room: str) -> list[Any]:

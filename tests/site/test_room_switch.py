@@ -13,9 +13,11 @@ from helpers.site_sim import Site, T_map_world, Walker
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.common_events import Connected, PrintLine
+from share.protocol.edge_events import PeerMessageReceived
+from share.site import room_switch
 from share.site.room_switch import RoomSwitch
 from share.wire.codec import encode
-from share.wire.messages import Bye
+from share.wire.messages import Bye, Ping
 
 KITCHEN, LAB = walls(1), walls(2)
 ONLY_IN_LAB = frozenset({("kitchen", "bob")})  # so that bob begins there
@@ -64,6 +66,22 @@ def test_each_keyframe_is_in_one_room(walked):
     assert report["unacknowledged"] == report["pending"] == 0
     assert report["sent"] == 40
     assert report["resent"] == 0
+
+
+def test_many_strangers_do_not_take_an_agent_back_to_the_room_that_it_left(monkeypatch):
+    """Both rooms know it, by as many keyframes: it was in both at once."""
+    monkeypatch.setattr(room_switch, "_MAX_ROUTES", 2)
+    site = two_rooms(frames=16)
+    site.walk(1)
+    while not site.switch.changes:
+        site.run(1)
+    ann = site.peer("ann")
+    assert {room: one.knows(ann) for room, one in site.rooms.items()} == {"kitchen": 17, "lab": 17}
+    for k in range(3):
+        site.to_edge(PeerMessageReceived(bytes([k]) * 16, [bytes(f) for f in encode(Ping(1, 1))]))
+    site.run(700)
+    assert not site.rooms["kitchen"].is_present("ann")
+    assert site.rooms["lab"].is_present("ann")
 
 
 def test_the_agent_is_not_told(walked):

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from share.cli.edge_output import run_summary
 from share.site.building import BuildingPose, RoomMap
 from share.site.report import site_plan, site_report
 
@@ -28,6 +29,14 @@ def test_an_agent_is_reported_by_the_room_where_it_is():
         }
         assert report["rooms"]["lab"]["agents"] == 1
         assert report["rooms"]["hall"]["agents"] == 0
+
+
+def test_counts_that_are_zero_in_all_rooms_are_counts_too():
+    """Without them the site ended with a KeyError, once its maps had loops and no merge."""
+    counts = {"loops": {"tried": 3, "accepted": 0}, "merges": {"requested": 0, "skipped": 0, "done": 0}}
+    report = site_report({"lab": room({}, **counts), "hall": room({}, **counts), "cellar": room({})}, {})
+    assert report["loops"] == {"tried": 6, "accepted": 0}
+    assert run_summary(report) == "loops: 6 tried, 0 accepted; 0 merges"
 
 
 def test_lines_name_their_room_and_counts_are_added():

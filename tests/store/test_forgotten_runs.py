@@ -121,6 +121,22 @@ def test_a_damaged_file_keeps_them(path: Path) -> None:
     assert list(kept.forgotten.items()) == list(before.forgotten.items())
 
 
+def test_it_is_said_where_they_are_lost_while_the_edge_runs(path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        (page,) = connection.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'image'").fetchone()
+    with path.open("r+b") as file:  # which the next keyframe meets
+        file.seek((page - 1) * PAGE_BYTES)
+        file.write(b"\xff" * PAGE_BYTES)
+    with MapStore.open(path) as store:
+        with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute(
+                "UPDATE about SET value = '21' WHERE name GLOB 'forgotten *'"
+            )  # but not its CRC
+        store.write([keyframe(BOB, 20)])
+        lost = "1 rows about the file, the credentials of runs and forgotten runs could not be read"
+        assert lost in store.problems
+
+
 def test_what_is_no_number_is_said(path: Path) -> None:
     with contextlib.closing(sqlite3.connect(path)) as connection, connection:
         for tag, value in (("00", "x"), ("01", "-1"), ("02", str(2**63)), ("03", None)):
@@ -150,6 +166,18 @@ def test_the_session_that_sets_a_map_aside_knows_them(path: Path, monkeypatch: p
         restarts = MapperRestarts(store, 0.1, print)
         assert restarts.load_map() == (None, [])
         assert restarts.forgotten == {ANNS_TAG: 20}
+
+
+def test_a_removed_run_is_known_by_the_copy_of_its_row_where_the_row_is_damaged(tmp_path: Path) -> None:
+    """As by a disk that fails while the edge runs: what was deleted could come back, and nothing said so."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    with MapStore.open(path) as store:
+        with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute("UPDATE run SET hello = x'ff' || substr(hello, 2) WHERE key = ?", (ANN,))
+        store.write(FORGOTTEN)
+    assert loaded(path).forgotten == {ANNS_TAG: 20}
 
 
 @pytest.mark.parametrize(("codec", "hello"), [(99, b"\x91\xc4\x00"), (8, b"\xff\xff")])

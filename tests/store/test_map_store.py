@@ -1,5 +1,6 @@
 """The map file: all that was written is read back to the last bit."""
 
+import errno
 import os
 import resource
 import shutil
@@ -33,7 +34,7 @@ from share.mapping.map_changes import (
     with_unknown_credentials,
 )
 from share.protocol.peer import restored_runs
-from share.store import schema
+from share.store import loading, schema
 from share.store.keyframe_archive import KeyframeArchive
 from share.store.map_store import MapStore, is_map
 from share.store.rows import insert
@@ -483,3 +484,21 @@ def test_a_map_with_another_name_is_refused(path):
             MapStore.open(name)
     other.unlink()
     assert len(reopened(path).keyframes) > 0
+
+
+def test_a_full_disk_is_said_when_a_map_is_opened(path, monkeypatch):
+    """SQLite says of it "disk I/O error": a person would look for a broken disk."""
+    MapStore.open(path).close()
+
+    def fails(connection, now_s):
+        error = sqlite3.OperationalError("disk I/O error")
+        error.sqlite_errorcode = sqlite3.SQLITE_IOERR
+        monkeypatch.setattr(tempfile, "TemporaryFile", full)
+        raise error
+
+    def full(dir):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(loading, "convert", fails)
+    with pytest.raises(StoreError, match="the map cannot be opened: No space left on device"):
+        MapStore.open(path)
