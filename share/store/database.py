@@ -164,6 +164,8 @@ def why_not_written(error: Exception, path: Path) -> str:
     written."""
     if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
         return "No space left on device"
+    if (message := size_limit_message(error, path)) is not None:
+        return message
     try:
         with tempfile.TemporaryFile(dir=path.parent) as file:
             file.write(bytes(PAGE_BYTES))
@@ -171,7 +173,7 @@ def why_not_written(error: Exception, path: Path) -> str:
             os.fsync(file.fileno())
     except OSError as system:
         return system.strerror or str(system)
-    return size_limit_message(error, path) or str(error)
+    return str(error)
 
 
 def size_limit_message(error: Exception, path: Path) -> str | None:
