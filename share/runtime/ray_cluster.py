@@ -18,7 +18,7 @@ from share.runtime.remote_worker import RoomWorker, read_answer, request_bytes
 
 _CPUS = 0.25  # of a room that is awake: fifty of five agents are the work of some ten mappers
 _CALLS = 4  # at a time: send, receive, write, and one at the end
-_START_S = 30.0  # for a worker's process, which imports SHARE
+_START_S = 60.0  # for a worker's process, which imports SHARE
 _PROBE_S = 1.0  # for a connection to a machine
 _LOCAL_STORE_BYTES = 100 * 2**20  # for objects in flight, of a cluster that is started here
 _HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # with empty settings

@@ -22,6 +22,7 @@ from share.mapping.map_changes import MapChange, StoredMap
 from share.runtime.mapper_process import RestoreMap, start_mapper_process
 from share.runtime.worker_process import WorkerProcess
 from share.store.map_store import MapStore
+from share.store.salvage import ReadRows
 
 _POLL_S = 2.0  # without an answer of the mapper, until `receive` returns nothing
 
@@ -63,6 +64,7 @@ class RoomWorker:
 
     def __init__(self) -> None:
         self._store: MapStore | None = None
+        self._rows: ReadRows | None = None  # as the front's session begins with them
         self._using_store = threading.Lock()
         self._mapper: WorkerProcess | None = None
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -121,10 +123,17 @@ class RoomWorker:
             outline = store.outline()
         except Exception as error:  # the front decides what becomes of the file
             outline = error if isinstance(error, StoreError) else ValueError(describe_exception(error))
-        keyframes = 0
+        self._rows = None
         with contextlib.suppress(ShareError):  # the outline says it
-            keyframes = len(store.rows().tables["keyframe"])
+            self._rows = store.rows()
+        keyframes = 0 if self._rows is None else len(self._rows.tables["keyframe"])
         return OpenedFile(store.writable, store.read_only_reason, store.problems, outline, keyframes)
+
+    def _take_rows(self) -> ReadRows:
+        """Return the rows of which the front was told: it may have written since."""
+        with self._using_store:
+            taken, self._rows = self._rows, None
+            return self._opened().rows() if taken is None else taken
 
     # ------------------------------------------------------------------ the mapper
 
@@ -143,8 +152,7 @@ class RoomWorker:
             return
         for message in messages:
             if isinstance(message, RestoreFile):
-                with self._using_store:
-                    message = RestoreMap(self._opened().rows(), message.has_keys)
+                message = RestoreMap(self._take_rows(), message.has_keys)
             self._mapper.send(message)
 
     def receive(self) -> MapperAnswers:
