@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from share.cli.edge_pages import EdgePages
     from share.cli.stderr import Stderr
     from share.config import Config
+    from share.runtime.remote_room import RemoteRooms
     from share.runtime.site_rooms import RoomSetup
     from share.site.rooms_file import SitePlan
 
@@ -34,6 +35,13 @@ if TYPE_CHECKING:
 @edge_options.http_token
 @edge_options.allow
 @edge_options.out
+@click.option(
+    "--ray",
+    "ray",
+    metavar="ADDRESS",
+    help="Spread the rooms over the machines of a Ray cluster: HOST:PORT, auto (that which runs here), or "
+    "local (one is started here, for a try).",
+)
 @options.config
 @options.verbose
 @options.as_json
@@ -46,6 +54,7 @@ def site(
     http_token: Path | None,
     allow: tuple[str, ...],
     out: Path | None,
+    ray: str | None,
     config_file: Path | None,
     verbose: bool,
     as_json: bool,
@@ -71,6 +80,7 @@ def site(
     Example:  share site --rooms rooms.yaml --http 8080
     """
     from contextlib import ExitStack, closing
+    from dataclasses import replace
 
     from share.cli.edge_output import print_access, print_event, run_summary
     from share.cli.edge_pages import EdgePages, PageOptions
@@ -93,11 +103,14 @@ def site(
     token = served.check(bind, False)
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
+        remote = None if ray is None else _join(stack, ray)
+        if remote is not None:
+            plan = replace(plan, folder=plan.folder.absolute())
         link = stack.enter_context(closing(bind_link(bind, key_pair, MAX_FRAME_BYTES)))
         pages = EdgePages(stack, stderr, served, token, None, tuple(plan.rooms))
         rooms = [_room_setup(stack, stderr, plan, name, settings, pages) for name in plan.rooms]
         on_event = partial(print_event, stderr, verbose)
-        run = EdgeRun(settings, link, out, on_event, allowed=allowed, rooms=rooms)
+        run = EdgeRun(settings, link, out, on_event, allowed=allowed, rooms=rooms, remote=remote)
         pages.run = stack.enter_context(closing(run))
         with stop_on_signal(run.stop):
             names = ", ".join(f"'{name}'" for name in plan.rooms)
@@ -106,6 +119,16 @@ def site(
             pages.print_addresses()
             report = run.run()
     click.echo(json.dumps(report) if as_json else run_summary(report))
+
+
+def _join(stack: ExitStack, address: str) -> RemoteRooms:
+    """Join a Ray cluster. Raises UsageError, ShareError."""
+    from contextlib import closing
+
+    from share.runtime.ray_cluster import RayCluster
+    from share.runtime.remote_room import RemoteRooms
+
+    return RemoteRooms(stack.enter_context(closing(RayCluster(address))).start_worker)
 
 
 def _room_setup(

@@ -22,6 +22,7 @@ from share.protocol.edge_events import PeerMessageReceived
 from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver, EdgeObservers
 from share.runtime.fault_guard import FaultGuard
+from share.runtime.remote_room import RemoteRooms
 from share.runtime.run_files import EdgeFiles
 from share.runtime.served_room import ServedRoom
 from share.runtime.site_rooms import RoomSetup, SiteRooms
@@ -53,9 +54,10 @@ class EdgeRun:
         allowed: Collection[Permission] = (),
         blinding: Blinding | None = None,
         rooms: Sequence[RoomSetup] = (),
+        remote: RemoteRooms | None = None,
     ) -> None:
         """rooms: of a site, each with what is its own; then `settings`, `store` and `blinding` are of none.
-        Raises StoreError if a map is unreadable."""
+        remote: see `SiteRooms`. Raises StoreError if a map is unreadable."""
         self._allowed, self._link, self._on_record = frozenset(allowed), link, on_record
         self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
@@ -73,7 +75,7 @@ class EdgeRun:
         self._has_observers = bool(observers or rooms)
         self._room: ServedRoom | SiteRooms
         if rooms:
-            self._room = SiteRooms(self, rooms, self._start_ns, has_keys)
+            self._room = SiteRooms(self, rooms, self._start_ns, has_keys, remote=remote)
         else:
             self._room = ServedRoom(
                 settings, self, self._start_ns, store, self._observer, blinding or NoBlinding(), has_keys

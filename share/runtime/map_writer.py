@@ -11,7 +11,7 @@ from share.errors import StoreError
 from share.mapping.map_changes import SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
 from share.runtime.output_writer import JobThread
-from share.store.map_store import MapStore
+from share.runtime.room_parts import RoomStore
 
 _RETRY_S = 1.0  # after a failed write
 _SLOW_WRITE_S = 5.0  # duration of one write from which it is reported as trouble
@@ -32,7 +32,7 @@ class MapWriter:
     """
 
     def __init__(
-        self, store: MapStore, on_saved: Callable[[ChangesSaved], None], notify: Callable[[str], None]
+        self, store: RoomStore, on_saved: Callable[[ChangesSaved], None], notify: Callable[[str], None]
     ) -> None:
         self._store, self._on_saved, self._notify = store, on_saved, notify
         self._pending: deque[SaveChanges] = deque()  # of the thread

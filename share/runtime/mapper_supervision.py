@@ -13,8 +13,8 @@ from share.errors import ShareError
 from share.mapping.map_changes import SaveObject, with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.mapper_process import MapperReport, RestoreMap
+from share.runtime.room_parts import RoomStore
 from share.store.forgetting import damaged_copies
-from share.store.map_store import MapStore
 from share.timing import Backoff
 
 TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
@@ -32,7 +32,7 @@ class MapperRestarts:
     """
 
     def __init__(
-        self, store: MapStore | None, known_m: float, notify: Callable[[str], None], has_keys: bool = False
+        self, store: RoomStore | None, known_m: float, notify: Callable[[str], None], has_keys: bool = False
     ) -> None:
         """known_m: see `share.protocol.peer.restored_runs`. has_keys: agents of this edge have keys."""
         self.store = store  # None also once a read-only map is no longer used

@@ -2,6 +2,7 @@
 
 awake -> nobody for a while -> a thread closes the room -> asleep
       -> a message for it, a keyframe to search or to forget -> the thread opens the map file -> awake
+awake -> its machine is gone -> a thread closes the room -> the thread opens the map file on another -> awake
 
 A room without a map file, or with one that may not be written, is always awake.
 """
@@ -25,10 +26,12 @@ from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
 from share.protocol.versions import refusal_of_version
+from share.runtime.mapper_supervision import RecentTroubles
 from share.runtime.output_writer import JobThread
 from share.runtime.room_host import RoomHost
+from share.runtime.room_parts import OpenedRoom, OpenRoom, RoomStore, StartMapping, open_here
 from share.runtime.served_room import ServedRoom
-from share.store.map_store import MapStore, oldest_arrival_s
+from share.store.map_store import oldest_arrival_s
 from share.timing import Backoff
 from share.wire.codec import decode, encode, message_type
 from share.wire.messages import NO_SESSION, Hello, Ping, Pong
@@ -49,10 +52,11 @@ class RoomStart:
     """With what a room is served. totals: of its earlier sessions; is_unchanged: the map file is as the last
     of them has left it; is_unused: the room falls asleep at once, so it needs no processes."""
 
-    store: MapStore | None
+    store: RoomStore | None
     totals: SessionTotals
     is_unchanged: bool = False
     is_unused: bool = False
+    start_mapper: StartMapping | None = None
 
 
 ServeRoom = Callable[[RoomStart], ServedRoom]
@@ -80,7 +84,7 @@ class _FileClosed:
 class _FileOpened:
     """is_unchanged: since the room fell asleep."""
 
-    store: MapStore
+    opened: OpenedRoom
     is_unchanged: bool
 
 
@@ -96,19 +100,21 @@ class RoomKeeper:
     """Serves one room, and lets it sleep, until `close`.
 
     serve: raises StoreError. idle_s: without anybody, until it sleeps. keep_s: how long keyframes are kept;
-    None: for ever. begins_asleep: if it may sleep.
+    None: for ever. begins_asleep: if it may sleep. open_room: opens the map file of a room that wakes up.
     """
 
     def __init__(
         self,
-        store: MapStore | None,
+        store: RoomStore | None,
         serve: ServeRoom,
         host: RoomHost,
         idle_s: float,
         keep_s: float | None = None,
         begins_asleep: bool = False,
+        open_room: OpenRoom = open_here,
     ) -> None:
         self._serve, self._host, self._idle_s, self._keep_s = serve, host, idle_s, keep_s
+        self._open_room = open_room
         self._path = store.path if store is not None and store.writable else None
         self._totals = SessionTotals()
         self._thread = JobThread("room")
@@ -121,6 +127,8 @@ class RoomKeeper:
         self._failure = ""  # why the map file cannot be opened
         self._retry_s = 0.0  # monotonic, as below
         self._backoff = Backoff(time.monotonic_ns())
+        self._is_lost = False  # its machine is gone, and it is closed for that
+        self._losses, self._loss_backoff = RecentTroubles(), Backoff(time.monotonic_ns())
         self._last_report: dict[str, Any] = {}
         self._last_series: Mapping[str, Mapping[str, Any]] = {}
         self._used_s = self._asleep_s = time.monotonic()  # last used, fallen asleep
@@ -187,12 +195,14 @@ class RoomKeeper:
         if self._room is not None:
             self._room.step()
             self._is_visit = self._is_visit and self._room.protocol.is_empty
-            if not self._room.is_idle:
+            if (loss := self._room.loss) is not None:
+                self._open_anew(self._room, loss)
+            elif not self._room.is_idle:
                 self._used_s = now_s
             elif self._path is not None and now_s - self._used_s >= self._until_sleep_s:
                 self._fall_asleep(self._room)
         elif self._path is not None and not self._is_changing and self._is_to_wake(now_s):
-            self._submit(partial(_open_map, self._path, self._closed_stamp))
+            self._submit(partial(_open_map, self._path, self._closed_stamp, self._open_room))
 
     def stop(self) -> None:
         """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
@@ -207,7 +217,7 @@ class RoomKeeper:
             return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         while not self._answers.empty():
             if isinstance(answer := self._answers.get(), _FileOpened):
-                answer.store.close()
+                answer.opened.store.close()
         room = self._room or self._closing
         return None if room is None else room.close()
 
@@ -232,6 +242,16 @@ class RoomKeeper:
         self._room, self._closing = None, room
         self._submit(partial(_end_processes, room))
 
+    def _open_anew(self, room: ServedRoom, loss: str) -> None:
+        """Close a room whose machine is gone, and wake it up at once on another."""
+        text = f"{loss}; the room is opened anew, agents resend what is not in the map file"
+        self._host.log_event("map", text)
+        self._losses.add(text)
+        self._fall_asleep(room)
+        self._is_called = self._is_lost = True
+        pause_s = self._loss_backoff.record_failure(time.monotonic_ns())
+        self._retry_s = time.monotonic() + (pause_s if self._loss_backoff.failures > 1 else 0.0)
+
     def _submit(self, job: Callable[[], _Answer]) -> None:
         """Have the thread do a job; `step` handles the answer."""
         self._is_changing = True
@@ -251,22 +271,25 @@ class RoomKeeper:
                 try:
                     self._closing.handle_answers()
                 finally:  # a file that stays open could not be opened again
-                    self._submit(partial(_close_file, self._closing, self._path, self._keep_s is not None))
+                    expires = self._keep_s is not None and not self._is_lost
+                    self._submit(partial(_close_file, self._closing, self._path, expires))
             case _FileClosed(incomplete_reason, oldest_s, stamp) if (closed := self._closing) is not None:
                 self._expiry_s = oldest_s + (self._keep_s or 0.0)
-                self._closing, self._closed_stamp = None, stamp
+                stamp = None if self._is_lost else stamp  # the directory may know more
+                self._closing, self._closed_stamp, self._is_lost = None, stamp, False
                 closed.finish(incomplete_reason)
-            case _FileOpened(store, is_unchanged):
-                self._wake_up(store, is_unchanged)
+            case _FileOpened(opened, is_unchanged):
+                self._wake_up(opened, is_unchanged)
             case _NotOpened(reason):
                 self._retry_later(reason)
 
-    def _wake_up(self, store: MapStore, is_unchanged: bool) -> None:
+    def _wake_up(self, opened: OpenedRoom, is_unchanged: bool) -> None:
         since_s = time.monotonic() - _REPEATED_S
+        start = RoomStart(opened.store, self._totals, is_unchanged, start_mapper=opened.start_mapper)
         try:
-            self._room = self._serve(RoomStart(store, self._totals, is_unchanged))
+            self._room = self._serve(start)
         except Exception as error:  # such as too many open files: the other rooms go on
-            store.close()
+            opened.store.close()
             self._retry_later(brief_reason(error))
             return
         self._failure, self._is_called, self._used_s = "", False, time.monotonic()
@@ -305,12 +328,14 @@ class RoomKeeper:
 
     def report(self) -> dict[str, Any]:
         """Return edge.json of the room; of a sleeping one as it was, with `asleep`."""
+        losses = self._losses.current()
         if self._room is not None:
-            return self._room.report()
-        trouble = [self._failure] if self._failure else []
+            report = self._room.report()
+            return {**report, "trouble": [*losses, *report["trouble"]]} if losses else report
+        trouble = [*losses, self._failure] if self._failure else losses
         if (took_s := self._thread.busy_s) >= _SLOW_S:
             what = "opening" if self._closing is None else "closing"
-            trouble.append(f"{what} the map file has taken {took_s:.0f} s so far: nobody can enter")
+            trouble = [*trouble, f"{what} the map file has taken {took_s:.0f} s so far: nobody can enter"]
         report = _aged(self._last_report, time.monotonic() - self._asleep_s)
         report.pop("loading", None)  # of a room that was never awake
         return {**report, "refused": [], "trouble": trouble, "asleep": True}
@@ -338,18 +363,19 @@ def _close_file(room: ServedRoom, path: Path, expires: bool) -> _FileClosed:
     return _FileClosed(incomplete_reason, oldest_s, _file_stamp(path))
 
 
-def _open_map(path: Path, closed_stamp: FileStamp | None) -> _FileOpened | _NotOpened:
+def _open_map(path: Path, closed_stamp: FileStamp | None, open_room: OpenRoom) -> _FileOpened | _NotOpened:
     stamp = _file_stamp(path)
     try:
         if stamp is None:  # its folder may come back
             raise StoreError(f"{path}: is gone since its room fell asleep; put it back, or restart the edge")
-        store = MapStore.open(path)
+        opened = open_room(path)
+        store = opened.store
         if not store.writable:  # keyframes would be acknowledged that no file has
             store.close()
             raise StoreError(f"{path}: the map cannot be written: {store.read_only_reason}")
         with contextlib.suppress(Exception):  # said when the room starts, or the file is set aside then
             store.outline()  # which takes a while, and is kept
-        return _FileOpened(store, stamp == closed_stamp)
+        return _FileOpened(opened, stamp == closed_stamp)
     except Exception as error:  # such as a folder of another machine that is away
         return _NotOpened(brief_reason(error))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import queue
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,15 +60,11 @@ from share.runtime.mapper_process import (
 )
 from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
 from share.runtime.room_host import OtherRooms, RoomHost
+from share.runtime.room_parts import MapperLink, RoomStore, StartMapping
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
-from share.runtime.worker_process import WorkerProcess
 from share.scheduling.policies import POLICIES
-from share.store.map_store import MapStore
 
 _DRAIN_S = 0.5  # wait for the map writer of a session that is over
-
-
-StartProcess = Callable[[Callable[[Any], None], Callable[[str], None], float], WorkerProcess]
 
 
 @dataclass(frozen=True)
@@ -97,13 +93,13 @@ class ServedRoom:
         settings: Config,
         host: RoomHost,
         start_ns: int,
-        store: MapStore | None,
+        store: RoomStore | None,
         observer: EdgeObserver,
         blinding: Blinding | NoBlinding,
         has_keys: bool,
         others: OtherRooms | None = None,
         totals: SessionTotals | None = None,
-        start_mapper: StartProcess = start_mapper_process,
+        start_mapper: StartMapping = start_mapper_process,
     ) -> None:
         self._settings, self._host, self._start_ns = settings, host, start_ns
         self._observer, self._blinding, self._others = observer, blinding, others
@@ -185,6 +181,12 @@ class ServedRoom:
         """Whether the map cannot be read now, so that nobody may enter."""
         return self._restart_due_s is not None
 
+    @property
+    def loss(self) -> str | None:
+        """What has happened to the machine of the map file and the mapper; None: it lives. A lost room does
+        nothing more, and is to be closed and opened anew."""
+        return None if self._restarts.store is None else self._restarts.store.loss
+
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe of another room's agent in the map."""
         if self._mapper_process is not None:
@@ -244,7 +246,7 @@ class ServedRoom:
         start_delay_s: delay of the mapper's start.
         """
         self._progress = MapperProgress()
-        self._mapper_process: WorkerProcess | None = None
+        self._mapper_process: MapperLink | None = None
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
         self._handover: KeyframeHandover  # where there is a mapper
@@ -286,7 +288,7 @@ class ServedRoom:
 
     def _restart_mapping(self, reason: str) -> None:
         """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
-        has_run = self._mapper_process is not None and self._mapper_process.pid is not None
+        has_run = self._mapper_process is not None and self._mapper_process.has_begun
         pause_s = self._restarts.record_death(has_run)
         text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
         self._host.log_event("mapper died", text)
@@ -338,7 +340,7 @@ class ServedRoom:
             case SolverDied() as solver:
                 self._host.log_event("solver died", solver.text)
                 self._troubles.add(f"the solver: {solver.text}")
-            case _MapperDied() as mapper if not self._stopping:
+            case _MapperDied() as mapper if not self._stopping and self.loss is None:
                 self._restart_mapping(f"its process {mapper.reason}")
 
     def _discard_answers(self) -> None:

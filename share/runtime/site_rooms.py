@@ -2,6 +2,7 @@
 of places that finds an agent's room.
 
 host (share.runtime.edge) -> RoomSwitch -> ServedRoom of each room -> host
+    -> its mapper and map file, here or on another machine (share.runtime.remote_room)
     -> directory thread (share.site.directory) -> rankings -> RoomSwitch
 """
 
@@ -28,8 +29,10 @@ from share.runtime.edge_observer import EdgeObserver
 from share.runtime.fault_guard import FaultGuard
 from share.runtime.mapper_process import start_mapper_process
 from share.runtime.output_writer import JobThread
+from share.runtime.remote_room import RemoteRooms
 from share.runtime.room_host import RoomHost
 from share.runtime.room_keeper import IDLE_S, RoomKeeper, RoomStart
+from share.runtime.room_parts import StartMapping, open_here
 from share.runtime.served_room import ServedRoom
 from share.runtime.spare_mapper import SpareMapper
 from share.runtime.worker_process import WorkerProcess
@@ -64,8 +67,8 @@ class RoomSetup:
 
 class SiteRooms:
     """The rooms of a site, until `close`; has the interface of one `ServedRoom`. Those of whom nothing is
-    known begin in the first room. idle_s: see `RoomKeeper`. Raises StoreError if the map of a room is
-    unreadable."""
+    known begin in the first room. idle_s: see `RoomKeeper`. remote: where mappers run and map files are
+    open; None: on this machine. Raises StoreError if the map of a room is unreadable."""
 
     def __init__(
         self,
@@ -74,7 +77,9 @@ class SiteRooms:
         start_ns: int,
         has_keys: bool,
         idle_s: float = IDLE_S,
+        remote: RemoteRooms | None = None,
     ) -> None:
+        self._remote = remote
         self._host, self._setups = host, {setup.name: setup for setup in setups}
         self._directory, self._thread = PlaceDirectory(), JobThread("directory")
         self._rankings: queue.SimpleQueue[RoomRanking] = queue.SimpleQueue()
@@ -95,12 +100,13 @@ class SiteRooms:
                 keep_s = None if keep_days is None else keep_days * DAY_S
                 if setup.store is not None and setup.store.rows().tables["keyframe"]:
                     self._unvisited.append(name)
-                keeper = RoomKeeper(setup.store, serve, room_host, idle_s, keep_s, begins_asleep=True)
+                open_room = open_here if remote is None else remote.open_room
+                keeper = RoomKeeper(setup.store, serve, room_host, idle_s, keep_s, True, open_room)
                 self._rooms[name], self._ports[name] = keeper, _Port(keeper)
         except BaseException:
             self.close()
             raise
-        if any(setup.store is not None for setup in setups):
+        if remote is None and any(setup.store is not None for setup in setups):
             self._spare.prepare()
 
     def _serve(
@@ -122,8 +128,15 @@ class SiteRooms:
             has_keys,
             _Neighbour(setup.name, self, keeps_places=start.is_unchanged),
             start.totals,
-            _never_started if start.is_unused else self._spare.take,
+            self._mapper_starter(start),
         )
+
+    def _mapper_starter(self, start: RoomStart) -> StartMapping:
+        if start.is_unused:
+            return _never_started
+        if self._remote is not None:
+            return start.start_mapper or self._remote.start_mapper
+        return self._spare.take
 
     def handle(self, event: PeerMessageReceived) -> None:
         room = self._switch.room_of(event.peer_id, event.frames)

@@ -60,6 +60,11 @@ class WorkerProcess:
         """None before the start."""
         return self._process.pid
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether the process could be started at all."""
+        return self.pid is not None
+
     def _start(self) -> None:
         """Start the process, unless it was closed before."""
         with self._starting:

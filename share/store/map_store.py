@@ -41,6 +41,8 @@ class MapStore:
     a line each.
     """
 
+    loss = None  # a machine that is gone takes this process with it
+
     def __init__(self, path: Path, opened: OpenedMap, reason: str) -> None:
         self.path, self.read_only_reason, self.problems = path, reason, opened.problems
         self._opened: ReadRows | None = opened.rows  # None: outdated
