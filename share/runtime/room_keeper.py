@@ -9,7 +9,6 @@ A room without a map file, or with one that may not be written, is always awake.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import queue
 import time
@@ -17,10 +16,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from share.errors import StoreError, VersionError, WireError, brief_reason
+from share.errors import VersionError, WireError, brief_reason
 from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
@@ -29,9 +27,19 @@ from share.protocol.versions import refusal_of_version
 from share.runtime.mapper_supervision import RecentTroubles
 from share.runtime.output_writer import JobThread
 from share.runtime.room_host import RoomHost
+from share.runtime.room_jobs import (
+    FileClosed,
+    FileOpened,
+    FileStamp,
+    NotOpened,
+    ProcessesEnded,
+    RoomAnswer,
+    close_file,
+    end_processes,
+    open_map,
+)
 from share.runtime.room_parts import OpenedRoom, OpenRoom, RoomStore, StartMapping, open_here
 from share.runtime.served_room import ServedRoom
-from share.store.map_store import oldest_arrival_s
 from share.timing import Backoff
 from share.wire.codec import decode, encode, message_type
 from share.wire.messages import NO_SESSION, Hello, Ping, Pong
@@ -42,7 +50,6 @@ _MAX_WAITING = 64  # messages, and keyframes to search, that wait until the room
 _REPEATED_S = 1.0  # after which all repeat what waits, hellos and pings, but those who have gone
 _SLOW_S = 5.0  # for the disk, from which it is reported as trouble
 _TIMEOUT_S = 10.0  # for the thread at the end
-_MAX_CLOSE_S = 86_400.0  # for the disk, when a room falls asleep
 
 _VISIT_S = 0.0  # as `IDLE_S`, of a room that nobody has asked for
 
@@ -60,40 +67,6 @@ class RoomStart:
 
 
 ServeRoom = Callable[[RoomStart], ServedRoom]
-FileStamp = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class _ProcessesEnded:
-    """Of a room that falls asleep. error: with which that failed; None: it did not."""
-
-    error: str | None
-
-
-@dataclass(frozen=True)
-class _FileClosed:
-    """oldest_s: when the oldest keyframe in the file arrived, unix s; infinity where all are kept. stamp: of
-    the file as the room has left it."""
-
-    incomplete_reason: str | None
-    oldest_s: float
-    stamp: FileStamp | None
-
-
-@dataclass(frozen=True, eq=False)
-class _FileOpened:
-    """is_unchanged: since the room fell asleep."""
-
-    opened: OpenedRoom
-    is_unchanged: bool
-
-
-@dataclass(frozen=True)
-class _NotOpened:
-    reason: str
-
-
-_Answer = _ProcessesEnded | _FileClosed | _FileOpened | _NotOpened
 
 
 class RoomKeeper:
@@ -118,7 +91,7 @@ class RoomKeeper:
         self._path = store.path if store is not None and store.writable else None
         self._totals = SessionTotals()
         self._thread = JobThread("room")
-        self._answers: queue.SimpleQueue[_Answer] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[RoomAnswer] = queue.SimpleQueue()
         self._messages: deque[tuple[float, PeerMessageReceived]] = deque(maxlen=_MAX_WAITING)
         self._searches: deque[FindKeyframe] = deque(maxlen=_MAX_WAITING)
         self._is_changing = False  # the thread closes or opens the room
@@ -134,7 +107,7 @@ class RoomKeeper:
         self._used_s = self._asleep_s = time.monotonic()  # last used, fallen asleep
         self._expiry_s = math.inf  # when the first keyframe of a sleeping room is too old, unix s
         self._closing: ServedRoom | None = None  # as long as the thread closes it
-        self._closed_stamp: FileStamp | None = None  # as in `_FileClosed`
+        self._closed_stamp: FileStamp | None = None  # as in `FileClosed`
         is_unused = begins_asleep and self._path is not None
         room = serve(RoomStart(store, self._totals, is_unused=is_unused))
         self._room: ServedRoom | None = room
@@ -202,7 +175,7 @@ class RoomKeeper:
             elif self._path is not None and now_s - self._used_s >= self._until_sleep_s:
                 self._fall_asleep(self._room)
         elif self._path is not None and not self._is_changing and self._is_to_wake(now_s):
-            self._submit(partial(_open_map, self._path, self._closed_stamp, self._open_room))
+            self._submit(partial(open_map, self._path, self._closed_stamp, self._open_room))
 
     def stop(self) -> None:
         """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
@@ -216,7 +189,7 @@ class RoomKeeper:
                 return None
             return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         while not self._answers.empty():
-            if isinstance(answer := self._answers.get(), _FileOpened):
+            if isinstance(answer := self._answers.get(), FileOpened):
                 answer.opened.store.close()
         room = self._room or self._closing
         return None if room is None else room.close()
@@ -240,7 +213,7 @@ class RoomKeeper:
         )
         self._totals, self._asleep_s = room.end_totals(), time.monotonic()
         self._room, self._closing = None, room
-        self._submit(partial(_end_processes, room))
+        self._submit(partial(end_processes, room))
 
     def _open_anew(self, room: ServedRoom, loss: str) -> None:
         """Close a room whose machine is gone, and wake it up at once on another."""
@@ -252,7 +225,7 @@ class RoomKeeper:
         pause_s = self._loss_backoff.record_failure(time.monotonic_ns())
         self._retry_s = time.monotonic() + (pause_s if self._loss_backoff.failures > 1 else 0.0)
 
-    def _submit(self, job: Callable[[], _Answer]) -> None:
+    def _submit(self, job: Callable[[], RoomAnswer]) -> None:
         """Have the thread do a job; `step` handles the answer."""
         self._is_changing = True
 
@@ -262,25 +235,25 @@ class RoomKeeper:
 
         self._thread.submit(run)
 
-    def _handle_answer(self, answer: _Answer) -> None:
+    def _handle_answer(self, answer: RoomAnswer) -> None:
         self._is_changing = False
         match answer:
-            case _ProcessesEnded(error) if self._closing is not None and self._path is not None:
+            case ProcessesEnded(error) if self._closing is not None and self._path is not None:
                 if error is not None:
                     self._host.log_event("internal error", error)
                 try:
                     self._closing.handle_answers()
                 finally:  # a file that stays open could not be opened again
                     expires = self._keep_s is not None and not self._is_lost
-                    self._submit(partial(_close_file, self._closing, self._path, expires))
-            case _FileClosed(incomplete_reason, oldest_s, stamp) if (closed := self._closing) is not None:
+                    self._submit(partial(close_file, self._closing, self._path, expires))
+            case FileClosed(incomplete_reason, oldest_s, stamp) if (closed := self._closing) is not None:
                 self._expiry_s = oldest_s + (self._keep_s or 0.0)
                 stamp = None if self._is_lost else stamp  # the directory may know more
                 self._closing, self._closed_stamp, self._is_lost = None, stamp, False
                 closed.finish(incomplete_reason)
-            case _FileOpened(opened, is_unchanged):
+            case FileOpened(opened, is_unchanged):
                 self._wake_up(opened, is_unchanged)
-            case _NotOpened(reason):
+            case NotOpened(reason):
                 self._retry_later(reason)
 
     def _wake_up(self, opened: OpenedRoom, is_unchanged: bool) -> None:
@@ -341,45 +314,6 @@ class RoomKeeper:
         return {**report, "refused": [], "trouble": trouble, "asleep": True}
 
 
-def _end_processes(room: ServedRoom) -> _ProcessesEnded:
-    try:
-        room.end_processes()
-    except Exception as error:  # such as no thread to be had: its file is closed all the same
-        return _ProcessesEnded(brief_reason(error))
-    return _ProcessesEnded(None)
-
-
-def _close_file(room: ServedRoom, path: Path, expires: bool) -> _FileClosed:
-    """Close the map file, however long its disk takes: nobody waits for it, and a file that is given up stays
-    locked. expires: keyframes that are too old are to be forgotten."""
-    try:
-        incomplete_reason = room.close_file(_MAX_CLOSE_S)
-    except Exception as error:  # likewise
-        incomplete_reason = brief_reason(error)
-    try:
-        oldest_s = oldest_arrival_s(path) if expires else math.inf
-    except Exception:
-        oldest_s = -math.inf  # said when the file is opened, which is due now
-    return _FileClosed(incomplete_reason, oldest_s, _file_stamp(path))
-
-
-def _open_map(path: Path, closed_stamp: FileStamp | None, open_room: OpenRoom) -> _FileOpened | _NotOpened:
-    stamp = _file_stamp(path)
-    try:
-        if stamp is None:  # its folder may come back
-            raise StoreError(f"{path}: is gone since its room fell asleep; put it back, or restart the edge")
-        opened = open_room(path)
-        store = opened.store
-        if not store.writable:  # keyframes would be acknowledged that no file has
-            store.close()
-            raise StoreError(f"{path}: the map cannot be written: {store.read_only_reason}")
-        with contextlib.suppress(Exception):  # said when the room starts, or the file is set aside then
-            store.outline()  # which takes a while, and is kept
-        return _FileOpened(opened, stamp == closed_stamp)
-    except Exception as error:  # such as a folder of another machine that is away
-        return _NotOpened(brief_reason(error))
-
-
 def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:
     """Return a room's report with the ages in it that much larger."""
     return {
@@ -394,15 +328,6 @@ def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:
 def _increased(fields: Mapping[str, Any], **more: float) -> dict[str, Any]:
     older = {name: round(fields[name] + n, 3) for name, n in more.items() if fields.get(name) is not None}
     return {**fields, **older}
-
-
-def _file_stamp(path: Path) -> FileStamp | None:
-    """Return inode, size and time of the last change; None if there is no such file."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _is_hello(event: PeerMessageReceived) -> bool:

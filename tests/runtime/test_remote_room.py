@@ -16,8 +16,8 @@ from helpers.worker_in_process import FakeMapper, NearWorker
 
 from share.errors import ShareError, StoreError, UsageError
 from share.runtime import remote_room, remote_worker
-from share.runtime.mapper_process import RestoreMap
 from share.runtime.map_writer import MapWriter
+from share.runtime.mapper_process import RestoreMap
 from share.runtime.remote_room import RemoteRooms, WorkerLostError
 from share.store.map_store import MapStore
 

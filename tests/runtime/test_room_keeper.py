@@ -21,7 +21,7 @@ from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import EdgeEvent, PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
-from share.runtime import room_keeper
+from share.runtime import room_jobs, room_keeper
 from share.runtime.room_keeper import RoomKeeper, RoomStart
 from share.store import database
 from share.store.map_store import MapStore
@@ -529,9 +529,9 @@ def test_a_disk_that_hangs_is_said_while_a_room_falls_asleep_or_wakes_up(bench, 
 
 
 def test_only_the_thread_looks_at_the_disk(bench, monkeypatch):
-    threads, stamp_of = [], room_keeper._file_stamp
+    threads, stamp_of = [], room_jobs.file_stamp
     monkeypatch.setattr(
-        room_keeper, "_file_stamp", lambda path: threads.append(threading.get_ident()) or stamp_of(path)
+        room_jobs, "file_stamp", lambda path: threads.append(threading.get_ident()) or stamp_of(path)
     )
     bench.step_until(is_awake=False)
     bench.keeper.handle(hello())
