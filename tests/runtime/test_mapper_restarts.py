@@ -392,7 +392,7 @@ class Process:
     """A mapper's process. pid: None if it could not be started."""
 
     def __init__(self, pid):
-        self.pid = pid
+        self.has_begun = pid is not None
 
     def send(self, message): ...
     def close(self): ...
