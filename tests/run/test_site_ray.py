@@ -61,7 +61,10 @@ def test_nodes_are_killed_with_rooms_on_them(tmp_path: Path) -> None:
         )
         seconds: list[float] = []
         for i in range(rounds):
-            seconds += kill_a_node(nodes, walkers, i)
+            seconds += (took := kill_a_node(nodes, walkers, i))
+            print(
+                f"kill {i}: {len(took)} rooms, answered again after {np.round(sorted(took), 2)} s", flush=True
+            )
         for walker in walkers:
             walker.finish()
         for walker in walkers:

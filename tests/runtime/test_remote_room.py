@@ -16,8 +16,8 @@ from helpers.worker_in_process import FakeMapper, NearWorker
 
 from share.errors import ShareError, StoreError, UsageError
 from share.runtime import remote_room, remote_worker
-from share.runtime.mapper_process import RestoreMap
 from share.runtime.map_writer import MapWriter
+from share.runtime.mapper_process import RestoreMap
 from share.runtime.remote_room import RemoteRooms, WorkerLostError
 from share.store.map_store import MapStore
 
@@ -128,7 +128,7 @@ def test_messages_and_answers_keep_their_order_and_none_is_lost_at_the_end(
     mappers[0].answer(-1)
     mapper.close()
     assert mappers[0].is_closed
-    assert answers == sorted(answers[:-1]) + [-1]
+    assert answers == [*sorted(answers[:-1]), -1]
     room.store.close()
 
 
