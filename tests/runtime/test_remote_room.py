@@ -84,12 +84,6 @@ def test_changes_are_acknowledged_when_the_worker_has_written_them(tmp_path: Pat
         assert len(store.rows().tables["keyframe"]) == 41
 
 
-def test_arrays_from_a_worker_can_be_written(tmp_path: Path) -> None:
-    _, room = opened(tmp_path / "room.sqlite", small_map())
-    assert all(one.keyframe.T_odom_body.flags.writeable for one in room.store.outline().keyframes)
-    room.store.close()
-
-
 @pytest.mark.usefixtures("mappers")
 def test_a_mapper_restores_the_rows_of_which_the_front_was_told(
     tmp_path: Path, mappers: list[FakeMapper]
