@@ -104,7 +104,7 @@ class RayCluster:
             where |= {"include_dashboard": False, "object_store_memory": _LOCAL_STORE_BYTES}
         try:
             ray.init(**where, log_to_driver=False, logging_level="ERROR", configure_logging=False)
-        except (Exception, SystemExit) as error:
+        except Exception as error:
             raise ShareError(f"--ray {address}: {_why_not_joined(str(error))}") from None
         self._worker_class = ray.remote(RoomWorker)
 

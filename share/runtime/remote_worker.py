@@ -70,8 +70,8 @@ class RoomWorker:
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def call(self, request: bytes) -> bytes:
-        """Return the answer to a request that `request_bytes` has made, for `read_answer`. Pickled here and
-        not by an engine, whose arrays cannot be written."""
+        """Return the answer to a request that `request_bytes` has made, for `read_answer`: one way in, on
+        which versions are compared and errors made lines."""
         version, *rest = pickle.loads(request)
         try:
             if version != __version__:

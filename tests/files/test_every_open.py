@@ -47,6 +47,9 @@ MEMORY = "into memory, or from bytes that are bounded"
 ALLOWED = {
     ("files/locks.py", "open"): "a folder, for its lock",
     ("cli/edge_output.py", "open"): "MapStore.open",
+    ("runtime/room_parts.py", "open"): "MapStore.open",
+    ("runtime/remote_worker.py", "open"): "MapStore.open",
+    ("runtime/remote_worker.py", "loads"): "from processes of the own site, through Ray, which does the same",
     ("cli/dataset_forget.py", "open"): "MapStore.open",
     ("cli/robot.py", "read_text"): "SHARE's own sources",
     ("robot/share_robot_node.py", "open"): "on a robot without SHARE: 500 bytes of a key",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.children import Child
-from helpers.crowd import EVERY, Walker, script
+from helpers.crowd import EVERY, Script, Walker, script
 from helpers.edge_sim import Person, walls
 from helpers.ray_nodes import RayNodes, memory_mb
 
@@ -42,25 +42,28 @@ def start_site(folder: Path, ray: str) -> tuple[Child, str]:
 
 @pytest.mark.slow
 def test_nodes_are_killed_with_rooms_on_them(tmp_path: Path) -> None:
-    rounds = 2
+    rounds = 6
+    place = walls(1)
+    people = [Person(name, place, 0.5 * i, 11 * (i + 1)) for i, name in enumerate(NAMES)]
+    scripts = [to_and_fro(script(person, 301), 600 + 400 * rounds) for person in people]
     nodes = RayNodes([2, 2])  # eight rooms fit on each
     try:
         for node in nodes.nodes:
             nodes.settle(node)
         site, address = start_site(tmp_path, nodes.address)
-        place = walls(1)
-        people = [Person(name, place, 0.5 * i, 11 * (i + 1)) for i, name in enumerate(NAMES)]
-        walkers = [Walker(p.hello, script(p, 600 + 200 * rounds), address) for p in people]
+        walkers = [Walker(p.hello, way, address) for p, way in zip(people, scripts, strict=True)]
         for walker in walkers:
             walker.start()
         for walker in walkers:
             until(f"{walker.name} is corrected", lambda w=walker: w.lives and w.lives[-1].corrected)
-        print(
-            f"memory of two nodes with five rooms: {[round(memory_mb(nodes.pids(n))) for n in nodes.nodes]} MB"
-        )
+        memory = [round(memory_mb(nodes.pids(node))) for node in nodes.nodes]
+        print(f"MB of two nodes with five rooms: {memory}, of the front: {memory_mb([site.process.pid]):.0f}")
         seconds: list[float] = []
         for i in range(rounds):
-            seconds += kill_a_node(nodes, walkers, i)
+            seconds += (took := kill_a_node(nodes, walkers, i))
+            print(
+                f"kill {i}: {len(took)} rooms, answered again after {np.round(sorted(took), 2)} s", flush=True
+            )
         for walker in walkers:
             walker.finish()
         for walker in walkers:
@@ -78,11 +81,19 @@ def test_nodes_are_killed_with_rooms_on_them(tmp_path: Path) -> None:
     print(f"{rounds} kills, {len(seconds)} rooms lost; answered again after s: {text}")
 
 
+def to_and_fro(way: Script, frames: int) -> Script:
+    """The same way again and again, which costs nothing to make."""
+    turn = len(way.T_odom_body) - 1
+    places = [turn - abs(k % (2 * turn) - turn) for k in range(frames)]
+    views = {k: way.views[place] for k, place in enumerate(places) if place in way.views}
+    return Script([way.T_odom_body[place] for place in places], views)
+
+
 def kill_a_node(nodes: RayNodes, walkers: list[Walker], number: int) -> list[float]:
     """Return after how many seconds each room that was on it answered again."""
     if len(nodes.nodes) < 2:
         nodes.nodes.append(nodes.add(2))
-    nodes.settle(nodes.nodes[-1])
+        nodes.settle(nodes.nodes[-1])
     time.sleep(0.1 * number)
     victim = nodes.nodes.pop(0)  # the one that has the rooms that were lost last
     rooms = [w for w in walkers if is_on(nodes, victim, w.name)]

@@ -84,12 +84,6 @@ def test_changes_are_acknowledged_when_the_worker_has_written_them(tmp_path: Pat
         assert len(store.rows().tables["keyframe"]) == 41
 
 
-def test_arrays_from_a_worker_can_be_written(tmp_path: Path) -> None:
-    _, room = opened(tmp_path / "room.sqlite", small_map())
-    assert all(one.keyframe.T_odom_body.flags.writeable for one in room.store.outline().keyframes)
-    room.store.close()
-
-
 @pytest.mark.usefixtures("mappers")
 def test_a_mapper_restores_the_rows_of_which_the_front_was_told(
     tmp_path: Path, mappers: list[FakeMapper]
@@ -128,7 +122,7 @@ def test_messages_and_answers_keep_their_order_and_none_is_lost_at_the_end(
     mappers[0].answer(-1)
     mapper.close()
     assert mappers[0].is_closed
-    assert answers == sorted(answers[:-1]) + [-1]
+    assert answers == [*sorted(answers[:-1]), -1]
     room.store.close()
 
 

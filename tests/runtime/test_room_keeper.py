@@ -15,7 +15,7 @@ from helpers.map_changes import small_map
 from helpers.map_files import is_locked
 
 from share.config import Config
-from share.errors import StoreError
+from share.errors import ShareError, StoreError
 from share.mapping.loops import KeyframeKey
 from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
@@ -40,6 +40,7 @@ class FakeRoom:
     is_idle: bool = True
     is_unused: bool = False
     is_ended: bool = False
+    loss: str | None = None
     handled: list[EdgeEvent] = field(default_factory=list)
     sought: list[FindKeyframe] = field(default_factory=list)
     threads: dict[str, int] = field(default_factory=dict)  # in which each part of the end ran
@@ -582,4 +583,51 @@ def test_an_error_while_it_falls_asleep_does_not_keep_the_file(bench, tmp_path, 
     bench.step_until(is_awake=False)
     assert not is_locked(tmp_path / "room.sqlite")
     bench.keeper.handle(hello())
+
+
+def lose(bench: Bench, room: FakeRoom) -> None:
+    room.loss = "machine 10.0.0.2 is gone"
+    bench.keeper.step()
+
+
+def test_a_room_whose_machine_is_gone_is_opened_anew_at_once(bench, tmp_path):
+    """Though nobody calls it; who is in it sends on."""
+    first = bench.rooms[0]
+    first.is_idle = False
+    bench.keeper.handle(hello())
+    lose(bench, first)
+    bench.keeper.handle(ping(ANN))
+    bench.step_until(is_awake=True)
+    second = bench.rooms[1]
+    assert first.is_ended
+    assert is_locked(tmp_path / "room.sqlite")
+    assert [event.peer_id for event in second.handled] == [peer_id(ANN.run_id)]
+    assert not second.is_unchanged  # the directory may know keyframes that are lost
+    assert bench.lines[0].startswith("machine 10.0.0.2 is gone; the room is opened anew")
+    assert bench.keeper.report()["trouble"][0] == bench.lines[0]
+
+
+def test_a_room_that_loses_machine_after_machine_waits_longer_and_longer(bench):
+    for number in range(3):
+        bench.rooms[number].is_idle = False
+        lose(bench, bench.rooms[number])
+        began = time.monotonic()
+        bench.step_until(is_awake=True)
+        assert time.monotonic() - began >= (0.0, 2.0, 4.0)[number] - 0.1
+    assert len(bench.rooms) == 4
+
+
+def test_a_room_for_which_no_machine_has_a_place_waits_and_says_so(bench):
+    def full(path: Path) -> Any:
+        raise ShareError("no machine has room for it")
+
+    opens = bench.keeper._open_room
+    bench.keeper._open_room = full
+    lose(bench, bench.rooms[0])
+    deadline = time.monotonic() + 20.0
+    while len(bench.lines) < 2:
+        assert time.monotonic() < deadline
+        bench.keeper.step()
+    assert bench.keeper.report()["trouble"][-1] == "no machine has room for it"
+    bench.keeper._open_room = opens
     bench.step_until(is_awake=True)
