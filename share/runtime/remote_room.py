@@ -191,7 +191,7 @@ class RemoteMapper:
             if not self._is_dead:
                 room.call("end_mapper", timeout_s=_END_S)
         except Exception as error:
-            self._die(str(error))
+            self._die(f"ended: {error}")
         if self._receiver is not None:
             self._receiver.join(_END_S)
         if self._owns_room:
@@ -217,7 +217,7 @@ class RemoteMapper:
                 if received.is_ended:
                     break
         except Exception as error:
-            self._die(str(error))
+            self._die(f"ended: {error}")
             return
         if received.reason is not None:
             self._die(received.reason)

@@ -143,6 +143,7 @@ def test_nothing_is_in_it_that_no_command_needs(program):
         "sklearn",
         "dask",
         "distributed",
+        "ray",
         "embreex",
         "moderngl",
         "trimesh",
