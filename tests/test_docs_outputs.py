@@ -29,7 +29,7 @@ from share.config import Config, EdgeConfig
 from share.event_kinds import EventKind
 from share.protocol.streaming import StreamingAgent
 from share.recordings.losses import DataLosses
-from share.runtime import edge, mapper_process, served_room
+from share.runtime import edge, mapper_process
 from share.runtime.edge import EdgeRun
 from share.runtime.edge_metrics import METRICS, render_metrics
 from share.runtime.frame_consumers import RemoteTracking
@@ -133,8 +133,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     messages.append((11, PoseUpdate(1, TrackState.OK, -1, np.eye(4), 5.0)))
     messages += [(run, k) for run, name in ((11, "ann"), (22, "bob")) for k in town.keyframes(name)]
     with pytest.MonkeyPatch.context() as patch:
-        for module in (served_room, mapper_process):
-            patch.setattr(module, "WorkerProcess", Thread)
+        patch.setattr(mapper_process, "WorkerProcess", Thread)
         for module in (edge, mapper_process):
             patch.setattr(module, "_REPORT_S", 0.02)
         yield Run(tmp_path_factory.mktemp("run"), Config(), messages, lambda report: "last_solve_s" in report)

@@ -17,7 +17,7 @@ from helpers.hellos import hello_of
 from share.config import Config
 from share.protocol.edge_events import AddKeyframe, AddRun, EdgeEffect, MapperResult, WriteEvent
 from share.protocol.peer import RestoredRun
-from share.runtime import mapper_process, served_room
+from share.runtime import mapper_process
 from share.runtime.edge import EdgeRun
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.room_plan import RoomPlan
@@ -57,8 +57,7 @@ def test_observers_see_runs_keyframes_decisions_corrections_poses_and_reports(
     town.walk(4)
     pose = PoseUpdate(7, TrackState.OK, 0, np.eye(4), 5.0)
     link: Any = Link([(11, hello_of("ann", 11)), *((11, k) for k in town.keyframes("ann")), (11, pose)])
-    for module in (served_room, mapper_process):
-        monkeypatch.setattr(module, "WorkerProcess", Thread)
+    monkeypatch.setattr(mapper_process, "WorkerProcess", Thread)
     seen, plan = Recorder(), RoomPlan()
     run = EdgeRun(Config(), link, None, lambda fields: None, observers=[seen, plan])
     thread = threading.Thread(target=run.run)

@@ -52,7 +52,7 @@ def setup_of(folder: Path, name: str, changes: list[Any]) -> RoomSetup:
 class Room:
     """Stands for a `ServedRoom`. name: by the policy of its settings."""
 
-    is_idle, protocol = False, EdgeProtocol(Config(), 7)
+    is_idle, loss, protocol = False, None, EdgeProtocol(Config(), 7)
 
     def __init__(self, settings: Config, *_: Any) -> None:
         self.settings, self.steps = settings, 0
