@@ -1,9 +1,11 @@
-"""Workers of rooms as actors of a Ray cluster. The only module that imports Ray (extra `site`)."""
+"""Hosts of rooms as actors of a Ray cluster, one on each machine. The only module that imports Ray (extra
+`site`)."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
+import itertools
 import os
 import re
 import socket
@@ -14,11 +16,14 @@ from typing import Any
 
 from share.errors import ShareError, UsageError, describe_exception, install_hint, printable
 from share.runtime.remote_room import WorkerLostError
-from share.runtime.remote_worker import RoomWorker, read_answer, request_bytes
+from share.runtime.remote_worker import RoomHost, read_answer, request_bytes
 
 _CPUS = 0.25  # of a room that is awake: fifty of five agents are the work of some ten mappers
 _CALLS = 4  # at a time: send, receive, write, and one at the end
-_START_S = 60.0  # for a worker's process, which imports SHARE
+_MAX_PLACES = 64  # of a machine, whose host relays all messages
+_START_S = 60.0  # for a host's process, which imports SHARE
+_LOOK_S = 2.0  # between looks for machines that have joined
+_END_S = 5.0  # for the thread, at the end
 _PROBE_S = 1.0  # for a connection to a machine
 _LOCAL_STORE_BYTES = 100 * 2**20  # for objects in flight, of a cluster that is started here
 _HTTP2_HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # with empty settings
@@ -34,15 +39,17 @@ class _Machine:
 
     @property
     def places(self) -> int:
-        return int(self.cpus / _CPUS)
+        return min(int(self.cpus / _CPUS), _MAX_PLACES)
 
 
 class RayWorker:
-    """An actor with a `RoomWorker`."""
+    """One room of a `RoomHost`, which is an actor."""
 
-    def __init__(self, ray: Any, cluster: RayCluster, machine: _Machine, actor: Any) -> None:
-        self._ray, self._cluster, self._machine, self._actor = ray, cluster, machine, actor
-        self._killing = threading.Lock()
+    def __init__(self, ray: Any, cluster: RayCluster, machine: _Machine, host: Any, room: int) -> None:
+        self._ray, self._cluster, self._machine = ray, cluster, machine
+        self._host, self._room = host, room
+        self._ending = threading.Lock()
+        self._is_ended = False
 
     @property
     def machine(self) -> str:
@@ -50,33 +57,29 @@ class RayWorker:
 
     def call(self, method: str, *arguments: Any, timeout_s: float | None = None) -> Any:
         """See `WorkerHandle`."""
+        if self._is_ended:
+            raise WorkerLostError("has ended the room")
         errors = self._ray.exceptions
         try:
-            answer = self._actor.call.remote(request_bytes(method, arguments))
+            answer = self._host.call.remote(self._room, request_bytes(method, arguments))
             answer = self._ray.get(answer, timeout=timeout_s)
         except errors.GetTimeoutError:
             raise WorkerLostError(f"has not answered for {timeout_s:g} s") from None
         except errors.RayError as error:
+            self._cluster.forget_host(self._machine, self._host)
             raise WorkerLostError(_why_lost(str(error))) from None
         except (OSError, RuntimeError, ValueError) as error:  # the cluster is gone
             raise WorkerLostError(f"cannot be reached: {describe_exception(error)}") from None
         return read_answer(answer)
 
     def kill(self) -> None:
-        with self._killing:
-            actor, self._actor = self._actor, _Killed()
-        if not isinstance(actor, _Killed):
+        """End the room. Does not wait."""
+        with self._ending:
+            was_ended, self._is_ended = self._is_ended, True
+        if not was_ended:
             self._cluster.release(self._machine)
-            with contextlib.suppress(Exception):  # it is gone, or the cluster is
-                self._ray.kill(actor)
-
-
-class _Killed:
-    """Stands for an actor that was killed."""
-
-    @property
-    def call(self) -> Any:
-        raise WorkerLostError("has ended the room")
+            with contextlib.suppress(Exception):  # the machine is gone, or the cluster is
+                self._host.drop.remote(self._room)
 
 
 class RayCluster:
@@ -106,14 +109,51 @@ class RayCluster:
             ray.init(**where, log_to_driver=False, logging_level="ERROR", configure_logging=False)
         except Exception as error:
             raise ShareError(f"--ray {address}: {_why_not_joined(str(error))}") from None
-        self._worker_class = ray.remote(RoomWorker)
+        self._host_class = ray.remote(RoomHost)
+        self._hosts: dict[str, Any] = {}  # by machine
+        self._numbers = itertools.count()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._keep_hosts, name="room hosts", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
-        """Leave the cluster, which ends all workers."""
+        """Leave the cluster, which ends all rooms."""
+        self._closing.set()
+        self._thread.join(_END_S)
         self._ray.shutdown()
 
+    def _keep_hosts(self) -> None:
+        """Start a host on each machine that joins, before a room needs it."""
+        while True:
+            with contextlib.suppress(Exception):  # said when a room is to start
+                for machine in self._machines():
+                    if machine.places and _is_reachable(machine.address, machine.port):
+                        self._host(machine)
+            if self._closing.wait(_LOOK_S):
+                return
+
+    def _host(self, machine: _Machine) -> Any:
+        """Return the host of a machine, which may yet have to start."""
+        options = {
+            "num_cpus": 0,  # `places` are counted here
+            "max_concurrency": _CALLS * machine.places + _CALLS,
+            "max_restarts": 0,
+        }
+        with self._choosing:
+            if machine.id not in self._hosts:
+                there = self._on_machine(machine.id, soft=False)
+                host = self._host_class.options(**options, scheduling_strategy=there).remote()
+                self._hosts[machine.id] = host
+            return self._hosts[machine.id]
+
+    def forget_host(self, machine: _Machine, host: Any) -> None:
+        """Start another one when a room needs it: this one has died."""
+        with self._choosing:
+            if self._hosts.get(machine.id) is host:
+                del self._hosts[machine.id]
+
     def start_worker(self) -> RayWorker:
-        """Start a worker on the machine with the most free places. Raises ShareError."""
+        """Begin a room on the machine with the most free places. Raises ShareError."""
         reasons = []
         for machine in self._machines():
             with self._choosing:
@@ -123,26 +163,19 @@ class RayCluster:
             if not _is_reachable(machine.address, machine.port):  # dead, and Ray does not know yet
                 self.release(machine)
                 continue
-            worker = self._start_on(machine)
+            host = self._host(machine)
+            worker = RayWorker(self._ray, self, machine, host, next(self._numbers))
             try:
                 worker.call("greet", timeout_s=_START_S)
                 return worker
             except ShareError as error:
                 worker.kill()
+                self.forget_host(machine, host)
                 reasons.append(f"{worker.machine} {error}")
         raise ShareError("; ".join(reasons) or self._why_full())
 
-    def _start_on(self, machine: _Machine) -> RayWorker:
-        options = {
-            "num_cpus": _CPUS,
-            "max_concurrency": _CALLS,
-            "max_restarts": 0,
-            "scheduling_strategy": self._on_machine(machine.id, soft=False),
-        }
-        return RayWorker(self._ray, self, machine, self._worker_class.options(**options).remote())
-
     def release(self, machine: _Machine) -> None:
-        """A worker on this machine has ended."""
+        """A room on this machine has ended."""
         with self._choosing:
             self._rooms[machine.id] -= 1
 

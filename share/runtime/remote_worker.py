@@ -1,4 +1,4 @@
-"""One room's map file and mapper, on the machine that the room's front has chosen (`remote_room`).
+"""Rooms' map files and mappers, on the machine that their front has chosen (`remote_room`).
 
 The file is opened where the mapper runs, since both read and write it, and SQLite's log is for one machine.
 """
@@ -111,6 +111,13 @@ class RoomWorker:
         with self._using_store:
             self._opened().close()
 
+    def end(self) -> None:
+        """End the mapper and close the file, of a room that its front has given up or closed."""
+        self.end_mapper()
+        with self._using_store:
+            if self._store is not None:
+                self._store.close()
+
     def _opened(self) -> MapStore:
         if self._store is None:
             raise StoreError("the map file is not open")
@@ -172,6 +179,26 @@ class RoomWorker:
         if mapper is not None:
             mapper.close()
             self._answers.put(_Ended(None))
+
+
+class RoomHost:
+    """The rooms of one machine, each by a number of its front's choice.
+
+    One process has them all, which is there before it is needed: a room that is opened waits for no start.
+    What computes are the mappers, in processes of their own.
+    """
+
+    def __init__(self) -> None:
+        self._workers: dict[int, RoomWorker] = {}
+
+    def call(self, room: int, request: bytes) -> bytes:
+        """See `RoomWorker.call`."""
+        return self._workers.setdefault(room, RoomWorker()).call(request)
+
+    def drop(self, room: int) -> None:
+        """End a room."""
+        if (worker := self._workers.pop(room, None)) is not None:
+            worker.end()
 
 
 def request_bytes(method: str, arguments: tuple[Any, ...]) -> bytes:

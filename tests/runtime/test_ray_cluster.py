@@ -23,16 +23,18 @@ class GetTimeoutError(RayError): ...
 
 
 class Actor:
-    """As of `ray.remote(RoomWorker).remote()`."""
+    """As of `ray.remote(RoomHost).remote()`."""
 
-    def __init__(self, worker: Any, node: str, world: World) -> None:
-        self.node, self.world, self._worker = node, world, worker
-        self.call = types.SimpleNamespace(remote=lambda request: (self, request))
+    def __init__(self, host: Any, node: str, world: World) -> None:
+        self.node, self.world, self._host = node, world, host
+        self.call = types.SimpleNamespace(remote=lambda room, request: (self, room, request))
+        self.drop = types.SimpleNamespace(remote=world.dropped.append)
+        world.hosts.append(node)
 
-    def answer(self, request: bytes) -> bytes:
-        if self in self.world.killed or self.node in self.world.errors:
-            raise RayError(self.world.errors.get(self.node, "The actor is dead because it was killed."))
-        return self._worker.call(request)
+    def answer(self, room: int, request: bytes) -> bytes:
+        if self.node in self.world.errors:
+            raise RayError(self.world.errors[self.node])
+        return self._host.call(room, request)
 
 
 class World:
@@ -41,7 +43,8 @@ class World:
     def __init__(self) -> None:
         self.servers: list[socket.socket] = []
         self.nodes: list[dict[str, Any]] = []
-        self.killed: list[Actor] = []
+        self.dropped: list[int] = []
+        self.hosts: list[str] = []  # nodes on which one was started
         self.errors: dict[str, str] = {}
         self.init_error: BaseException | None = None
         self.joined: dict[str, Any] = {}
@@ -61,8 +64,7 @@ class World:
         ray.exceptions = types.ModuleType("ray.exceptions")
         ray.exceptions.RayError, ray.exceptions.GetTimeoutError = RayError, GetTimeoutError
         ray.init, ray.nodes, ray.shutdown = self.init, lambda: self.nodes, lambda: None
-        ray.get = lambda ref, timeout=None: ref[0].answer(ref[1])
-        ray.kill = self.killed.append
+        ray.get = lambda ref, timeout=None: ref[0].answer(*ref[1:])
         ray.remote = lambda cls: types.SimpleNamespace(options=lambda **how: self._options(cls, **how))
         return ray
 
@@ -102,10 +104,12 @@ def test_rooms_go_where_most_places_are_free(world: World) -> None:
     world.add("large", 2)
     cluster = RayCluster("auto")
     workers = [cluster.start_worker() for _ in range(8)]
+    assert sorted(world.hosts) == ["large", "small"]  # one on each machine with places
     assert [one._machine.id for one in workers].count("large") == 6
     for one in workers[:4]:
         one.kill()
         one.kill()  # counts once
+    assert world.dropped == [0, 1, 2, 3]
     again = [cluster.start_worker() for _ in range(8)]
     assert len(again) == 8
     with pytest.raises(ShareError, match=r"no machine .* has room for it: 2 with 12 places in all"):
@@ -131,7 +135,8 @@ def test_a_machine_without_share_is_said_and_another_taken(world: World) -> None
 
 def test_what_a_dead_actor_says_is_a_line(world: World) -> None:
     world.add("one", 1)
-    worker = RayCluster("auto").start_worker()
+    cluster = RayCluster("auto")
+    worker = cluster.start_worker()
     for said, line in (
         ("The actor died because its node has died. Node Id: 0a5e", "is gone"),
         ("The actor 18 is unavailable: RpcError: Socket closed rpc_code: 14", "does not answer"),
@@ -140,6 +145,9 @@ def test_what_a_dead_actor_says_is_a_line(world: World) -> None:
         world.errors["one"] = said
         with pytest.raises(WorkerLostError, match=f"^{line}"):
             worker.call("greet")
+    del world.errors["one"]
+    cluster.start_worker()
+    assert world.hosts == ["one", "one"]  # it was started anew, once
     worker.kill()
     with pytest.raises(WorkerLostError, match="has ended the room"):
         worker.call("greet")

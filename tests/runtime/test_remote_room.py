@@ -283,3 +283,22 @@ def test_ray_is_not_imported_without_being_asked_for() -> None:
     code = "import sys, share.cli.site, share.runtime.edge; sys.exit('ray' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     assert remote_room.__name__ in sys.modules
+
+
+def test_a_host_has_rooms_that_know_nothing_of_each_other(tmp_path: Path, mappers: list[FakeMapper]) -> None:
+    host = remote_worker.RoomHost()
+
+    def call(room: int, method: str, *arguments: Any) -> Any:
+        return remote_worker.read_answer(host.call(room, remote_worker.request_bytes(method, arguments)))
+
+    for room in (1, 2):
+        call(room, "open_map", tmp_path / f"{room}.sqlite")
+        call(room, "start_mapper")
+    call(1, "write", small_map())
+    assert call(2, "describe_map").keyframes == 0
+    host.drop(1)
+    host.drop(1)
+    assert [one.is_closed for one in mappers] == [True, False]
+    assert not is_locked(tmp_path / "1.sqlite")
+    assert is_locked(tmp_path / "2.sqlite")
+    host.drop(2)
