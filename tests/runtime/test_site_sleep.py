@@ -110,7 +110,7 @@ def test_rooms_sleep_and_a_run_that_returns_goes_on_in_its_room(tmp_path: Path) 
     most_awake = 0
 
     def step_until(condition: Any) -> dict[str, Any]:
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + 180.0
         while not condition(report := site.report()):
             assert time.monotonic() < deadline, (report["directory"], report["rooms"])
             time.sleep(0.01)
