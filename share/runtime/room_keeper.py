@@ -41,7 +41,7 @@ from share.runtime.room_jobs import (
 from share.runtime.room_parts import OpenedRoom, OpenRoom, RoomStore, StartMapping, open_here
 from share.runtime.served_room import ServedRoom
 from share.timing import Backoff
-from share.wire.codec import decode, encode, message_type
+from share.wire.codec import decode_only, encode, message_type
 from share.wire.messages import NO_SESSION, Hello, Ping, Pong
 from share.wire.room_messages import ClientHello
 
@@ -50,8 +50,6 @@ _MAX_WAITING = 64  # messages, and keyframes to search, that wait until the room
 _REPEATED_S = 1.0  # after which all repeat what waits, hellos and pings, but those who have gone
 _SLOW_S = 5.0  # for the disk, from which it is reported as trouble
 _TIMEOUT_S = 10.0  # for the thread at the end
-
-_VISIT_S = 0.0  # as `IDLE_S`, of a room that nobody has asked for
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ class RoomKeeper:
                 self._open_anew(self._room, loss)
             elif not self._room.is_idle:
                 self._used_s = now_s
-            elif self._path is not None and now_s - self._used_s >= self._until_sleep_s:
+            elif self._path is not None and now_s - self._used_s >= (0.0 if self._is_visit else self._idle_s):
                 self._fall_asleep(self._room)
         elif self._path is not None and not self._is_changing and self._is_to_wake(now_s):
             self._submit(partial(open_map, self._path, self._closed_stamp, self._open_room))
@@ -199,10 +197,6 @@ class RoomKeeper:
     def _is_to_wake(self, now_s: float) -> bool:
         is_called = self._is_called or time.time() >= self._expiry_s
         return is_called and now_s >= self._retry_s
-
-    @property
-    def _until_sleep_s(self) -> float:
-        return _VISIT_S if self._is_visit else self._idle_s
 
     def _fall_asleep(self, room: ServedRoom) -> None:
         self._is_visit = False
@@ -341,7 +335,6 @@ def _is_hello(event: PeerMessageReceived) -> bool:
 
 def _ping_of(event: PeerMessageReceived) -> Ping | None:
     try:
-        message = decode(event.frames) if message_type(event.frames) is Ping else None
+        return decode_only(event.frames, Ping)
     except WireError:
         return None
-    return message if isinstance(message, Ping) else None

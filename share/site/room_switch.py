@@ -19,7 +19,7 @@ from share.site.directory import RoomRanking
 from share.site.room_finder import RoomFinder, RoomFound
 from share.timing import seconds_to_ns
 from share.types import Keyframe
-from share.wire.codec import decode, message_type
+from share.wire.codec import decode_only
 from share.wire.layouts import Bytes
 from share.wire.messages import Hello
 from share.wire.room_messages import ClientHello
@@ -105,13 +105,13 @@ class RoomSwitch:
         first of all for other messages."""
         rooms = list(self._rooms)
         try:
-            message = decode(frames) if message_type(frames) in (Hello, ClientHello) else None
+            hello = decode_only(frames, Hello, ClientHello)
         except WireError:
             return rooms[0]
-        if not isinstance(message, Hello | ClientHello):
+        if not isinstance(hello, Hello | ClientHello):
             return rooms[0]
-        allowed = [room for room in rooms if self._may_enter(room, message.name)]
-        present = [room for room in allowed if self._rooms[room].is_present(message.name)]
+        allowed = [room for room in rooms if self._may_enter(room, hello.name)]
+        present = [room for room in allowed if self._rooms[room].is_present(hello.name)]
         return next(iter([*present, *allowed]), None)
 
     # ------------------------------------------------------------------ searches

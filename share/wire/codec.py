@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from share.errors import VersionError, WireError, printable
 from share.wire import messages as m
 from share.wire.layouts import KEYFRAME_WITHOUT_IMAGE, LAYOUTS, MESSAGE_TYPES, Bytes, Header, encode_plain
+
+M = TypeVar("M", bound=m.Message)
 
 WIRE_VERSION = 8
 OLDEST_VERSION = 2  # the STABLE_MESSAGES have not changed since
@@ -72,6 +74,16 @@ def decode(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -
         return layout.build(**layout.decode_scalars(header.scalars), **layout.decode_arrays(header, frames))
     except _DECODE_ERRORS as error:
         raise _wire_error(kind.__name__, error) from None
+
+
+def decode_only(frames: Sequence[Bytes], *kinds: type[M]) -> M | None:
+    """Return the message if its header says one of these kinds, else None, without reading the rest. Raises
+    as `decode`."""
+    if message_type(frames) not in kinds:
+        return None
+    message = decode(frames)
+    assert isinstance(message, kinds)
+    return message
 
 
 def message_type(frames: Sequence[Bytes], versions: Sequence[int] = (WIRE_VERSION,)) -> type[m.Message]:
