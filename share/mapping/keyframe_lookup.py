@@ -208,8 +208,6 @@ class KeyframeLookup:
         self._counters.count_tried(b.agent)
         if isinstance(outcome, Refusal):
             return [MapEvent(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        if search is not None and not atlas.quarantine.agreement.are_separated(a.agent, b.agent):
-            search.count_verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers, is_confirmed=outcome.is_confirmed)
         self._counters.count_merge(b.agent, "requested")
         change = atlas.quarantine.add_loop(loop, outcome.depth_scale)
@@ -219,6 +217,8 @@ class KeyframeLookup:
             atlas.quarantine.rescale_loop(loop, outcome.depth_scale), is_answer=not self._is_revisit
         )
         self._log.record_loops(decision)
+        if search is not None and (decision.accepted or atlas.graph.is_same_map(candidate, node_id)):
+            search.count_verified()  # not a pending merge: it needs loops of several keyframes
         reason = f"{decision.reason} ({outcome.reason})"
         if not decision.accepted:
             return [*events, MapEvent(b.agent, "loop not accepted", reason)]

@@ -35,6 +35,11 @@ class Exchange:
         return (self.returned_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
 
     @property
+    def middle_ns(self) -> int:
+        """Time of `offset_ns`, by our clock."""
+        return (self.sent_ns + self.returned_ns) // 2
+
+    @property
     def unverified_ns(self) -> int:
         """Twice the error bound of `offset_ns` if one of the other side's two times is forged: the other
         time was read within the exchange, and our clock has measured its length."""
@@ -89,8 +94,7 @@ class ClockFilter:
         self._P: F64 = np.zeros((2, 2))
         self._base_ns = 0  # the filtered offset is relative to this, so that it stays small
         self._updated_ns = 0
-        self._recent_rtt_ns: deque[int] = deque(maxlen=LEAST_OF)
-        self._recent_unverified_ns: deque[int] = deque(maxlen=LEAST_OF)
+        self._recent: deque[Exchange] = deque(maxlen=LEAST_OF)
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 0  # since the clock was last set
 
@@ -105,16 +109,13 @@ class ClockFilter:
         if not exchange.is_valid or abs(exchange.offset_ns) > MAX_OFFSET_NS:
             self.rejected += 1
             return False
-        rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
-        middle_ns = (sent_ns + returned_ns) // 2
-        self._recent_rtt_ns.append(rtt_ns)
-        self._recent_unverified_ns.append(exchange.unverified_ns)
-        self.rtt_ms = exponential_average(self.rtt_ms, rtt_ns / 1e6)
-        variance = self._variance(rtt_ns)
+        self._recent.append(exchange)
+        self.rtt_ms = exponential_average(self.rtt_ms, exchange.delay_ns / 1e6)
+        variance = self._variance(exchange.delay_ns)
         if self._x is None:
-            self._initialise(offset_ns, middle_ns, variance)
+            self._initialise(exchange, variance)
             return True
-        return self._gated_update(self._x, offset_ns, middle_ns, variance)
+        return self._gated_update(self._x, exchange, variance)
 
     def offset_ns(self, now_ns: int) -> int | None:
         """Return edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
@@ -136,7 +137,7 @@ class ClockFilter:
 
         Half of the least `Exchange.unverified_ns` among recent exchanges. The edge's stated holding time is
         added, so that an edge that overstates it enlarges the bound."""
-        return -(-min(self._recent_unverified_ns) // 2) if self._recent_unverified_ns else None
+        return -(-min(one.unverified_ns for one in self._recent) // 2) if self._recent else None
 
     @property
     def drift_ppm(self) -> float | None:
@@ -156,31 +157,51 @@ class ClockFilter:
     def _variance(self, rtt_ns: int) -> float:
         """Return the variance of an offset, us^2. Its error is at most half the round trip (RFC 5905,
         section 8)."""
-        has_enough = len(self._recent_rtt_ns) >= _MIN_EXCHANGES
-        excess_us = (rtt_ns - (min(self._recent_rtt_ns) if has_enough else 0)) / 1e3
+        has_enough = len(self._recent) >= _MIN_EXCHANGES
+        excess_us = (rtt_ns - (min(one.delay_ns for one in self._recent) if has_enough else 0)) / 1e3
         return NOISE_US**2 + (ASYMMETRY * excess_us) ** 2
 
-    def _initialise(self, offset_ns: int, at_ns: int, variance: float) -> None:
+    def _initialise(self, exchange: Exchange, variance: float) -> None:
         self._x, self._P = np.zeros(2), np.diag([variance, DRIFT_PPM**2])
-        self._base_ns, self._updated_ns = offset_ns, at_ns
+        self._base_ns, self._updated_ns = exchange.offset_ns, exchange.middle_ns
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 1
 
-    def _gated_update(self, x: F64, offset_ns: int, at_ns: int, variance: float) -> bool:
-        self._x, self._P = x, P = self._predict(x, at_ns)
-        self._updated_ns = max(at_ns, self._updated_ns)
-        z = (offset_ns - self._base_ns) / 1e3
+    def _gated_update(self, x: F64, exchange: Exchange, variance: float) -> bool:
+        self._x, self._P = x, P = self._predict(x, exchange.middle_ns)
+        self._updated_ns = max(exchange.middle_ns, self._updated_ns)
+        z = (exchange.offset_ns - self._base_ns) / 1e3
         if (z - x[0]) ** 2 > GATE_SIGMA**2 * (P[0, 0] + variance):
             self._consecutive_rejects += 1
             self.rejected += 1
             if self._consecutive_rejects >= STEP_AFTER:
                 self.steps += 1
-                self._initialise(offset_ns, at_ns, variance)
+                self._recent = deque([exchange], LEAST_OF)
+                self._initialise(exchange, variance)
             return False
-        self._x, self._P = self._kalman.update(x, P, z, np.array([[variance]]), np.array([[1.0, 0.0]]))
+        self._limit_offset(*self._measure(x, P, z, variance))
         self._consecutive_rejects = 0
         self._agreeing_exchanges += 1
         return True
+
+    def _measure(self, x: F64, P: F64, z: float, variance: float) -> tuple[F64, F64]:
+        x, P = self._kalman.update(x, P, z, np.array([[variance]]), np.array([[1.0, 0.0]]))
+        return x, P
+
+    def _limit_offset(self, x: F64, P: F64) -> None:
+        """Keep the offset within the error bounds of all recent exchanges. Where one side waits for a core
+        again and again, exchanges err in one direction, and the filter alone would leave the bounds."""
+        times, offsets, delays = np.array([(e.middle_ns, e.offset_ns, e.delay_ns) for e in self._recent]).T
+        age_s = np.abs(times - self._updated_ns) / SECOND_NS
+        error_us = delays / 2e3 + DRIFT_PPM * age_s
+        offset_us = (offsets - self._base_ns) / 1e3
+        low, high = float((offset_us - error_us).max()), float((offset_us + error_us).min())
+        nearest = min(max(float(x[0]), low), high)
+        if low <= high and nearest != x[0]:
+            shift = nearest - float(x[0])
+            x, P = self._measure(x, P, nearest, 1e-6 * P[0, 0])
+            P = P + np.diag([shift**2, 0.0])
+        self._x, self._P = x, P
 
     def _predict(self, x: F64, now_ns: int) -> tuple[F64, F64]:
         """Return state (2,) and covariance (2, 2) at `now_ns`, with random walks of offset and drift."""
