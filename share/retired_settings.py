@@ -148,7 +148,7 @@ RETIRED_SETTINGS: dict[str, str] = {
     "clock.drift_walk_ppm": "protocol.edge_clock.DRIFT_WALK_PPM",
     "clock.drift_ppm": "protocol.edge_clock.DRIFT_PPM",
     "clock.least_of": "protocol.edge_clock.LEAST_OF",
-    "clock.gate_sigma": "protocol.edge_clock.GATE_SIGMA",
+    "clock.gate_sigma": "protocol.edge_clock.STEP_AFTER",  # what contradicts the bounds is rejected
     "clock.step_after": "protocol.edge_clock.STEP_AFTER",
 }
 

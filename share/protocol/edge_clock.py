@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -56,13 +57,13 @@ NOISE_US = 20.0  # standard deviation of an exchange that was not queued
 ASYMMETRY = 0.5  # error of an offset as a share of the delay above the minimum; 0.5 is the bound
 OFFSET_WALK_US = 4.0  # random walk of the offset, per sqrt(s)
 DRIFT_WALK_PPM = 0.05  # random walk of the drift, per sqrt(s)
-DRIFT_PPM = 100.0  # initial standard deviation of the drift
-LEAST_OF = 64  # recent exchanges among which the minimum delay is taken
-GATE_SIGMA = 4.0  # an exchange further off is rejected
-STEP_AFTER = 5  # rejected exchanges in a row after which the filter restarts: the clock was set
+DRIFT_PPM = 100.0  # initial standard deviation of the drift, and its limit in the bounds of the offset
+LEAST_OF = 64  # recent exchanges, among which the minimum delay is taken and which bound the offset
+STEP_AFTER = 5  # contradictory exchanges in a row after which the filter restarts: the clock was set
 _SMOOTHING = 1 / 8  # RFC 6298, section 2
 MAX_OFFSET_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks start at boot: no machine has run for longer
 _MIN_AGREEING = 3  # agreeing exchanges before a clock is accepted: its stamps must advance as ours do
+_EXACT = 1e-6  # share of the variance that stays where the offset is moved to a bound
 _MIN_EXCHANGES = 8  # exchanges before the fastest counts as free of queueing
 
 
@@ -75,8 +76,9 @@ class ClockFilter:
     """Kalman filter over [offset (us), drift (us/s = ppm)] of edge time minus agent time.
 
     Measurement: RFC 5905, section 8. An exchange slower than the fastest recent one was queued, on an unknown
-    part of the path: its variance grows with the square of the excess. No such filter observes a constant
-    asymmetry of the path: it is not in `sigma_ns`, but bounded by `asymmetry_ns`.
+    part of the path: its variance grows with the square of the excess. Each exchange bounds the offset too,
+    and the estimate stays within the bounds of all recent ones. No filter observes a constant asymmetry of
+    the path: it is not in `sigma_ns`, but bounded by `asymmetry_ns`.
     """
 
     def __init__(self) -> None:
@@ -95,6 +97,7 @@ class ClockFilter:
         self._base_ns = 0  # the filtered offset is relative to this, so that it stays small
         self._updated_ns = 0
         self._recent: deque[Exchange] = deque(maxlen=LEAST_OF)
+        self._bound_us = 0.0  # of the error, at `_updated_ns`
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 0  # since the clock was last set
 
@@ -109,13 +112,11 @@ class ClockFilter:
         if not exchange.is_valid or abs(exchange.offset_ns) > MAX_OFFSET_NS:
             self.rejected += 1
             return False
-        self._recent.append(exchange)
         self.rtt_ms = exponential_average(self.rtt_ms, exchange.delay_ns / 1e6)
-        variance = self._variance(exchange.delay_ns)
         if self._x is None:
-            self._initialise(exchange, variance)
+            self._initialise(exchange)
             return True
-        return self._gated_update(self._x, exchange, variance)
+        return self._add(self._x, exchange, self._variance(exchange.delay_ns))
 
     def offset_ns(self, now_ns: int) -> int | None:
         """Return edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
@@ -133,11 +134,12 @@ class ClockFilter:
 
     @property
     def asymmetry_ns(self) -> int | None:
-        """Bound of the unobservable error of `offset_ns`, rounded up; None before the first exchange.
+        """Bound of the error of `offset_ns` at the last exchange that any asymmetry of the path can cause,
+        rounded up; None before the first exchange.
 
-        Half of the least `Exchange.unverified_ns` among recent exchanges. The edge's stated holding time is
+        By the recent exchanges, each with its `Exchange.unverified_ns`: the edge's stated holding time is
         added, so that an edge that overstates it enlarges the bound."""
-        return -(-min(one.unverified_ns for one in self._recent) // 2) if self._recent else None
+        return None if self._x is None else math.ceil(self._bound_us * 1e3)
 
     @property
     def drift_ppm(self) -> float | None:
@@ -157,29 +159,40 @@ class ClockFilter:
     def _variance(self, rtt_ns: int) -> float:
         """Return the variance of an offset, us^2. Its error is at most half the round trip (RFC 5905,
         section 8)."""
-        has_enough = len(self._recent) >= _MIN_EXCHANGES
-        excess_us = (rtt_ns - (min(one.delay_ns for one in self._recent) if has_enough else 0)) / 1e3
+        delays_ns = [one.delay_ns for one in self._recent]
+        fastest_ns = min(rtt_ns, *delays_ns) if len(delays_ns) >= _MIN_EXCHANGES - 1 else 0
+        excess_us = (rtt_ns - fastest_ns) / 1e3
         return NOISE_US**2 + (ASYMMETRY * excess_us) ** 2
 
-    def _initialise(self, exchange: Exchange, variance: float) -> None:
-        self._x, self._P = np.zeros(2), np.diag([variance, DRIFT_PPM**2])
+    def _initialise(self, exchange: Exchange) -> None:
+        self._recent = deque([exchange], LEAST_OF)
+        self._x, self._P = np.zeros(2), np.diag([self._variance(exchange.delay_ns), DRIFT_PPM**2])
         self._base_ns, self._updated_ns = exchange.offset_ns, exchange.middle_ns
+        self._bound_us = exchange.unverified_ns / 2e3
         self._consecutive_rejects = 0
         self._agreeing_exchanges = 1
 
-    def _gated_update(self, x: F64, exchange: Exchange, variance: float) -> bool:
+    def _add(self, x: F64, exchange: Exchange, variance: float) -> bool:
+        """Update with an exchange, unless the edge's clock was set: its bounds contradict all recent ones."""
         self._x, self._P = x, P = self._predict(x, exchange.middle_ns)
         self._updated_ns = max(exchange.middle_ns, self._updated_ns)
-        z = (exchange.offset_ns - self._base_ns) / 1e3
-        if (z - x[0]) ** 2 > GATE_SIGMA**2 * (P[0, 0] + variance):
+        low, high = self._offset_bounds_us(exchange)
+        if low > high:
             self._consecutive_rejects += 1
             self.rejected += 1
             if self._consecutive_rejects >= STEP_AFTER:
                 self.steps += 1
-                self._recent = deque([exchange], LEAST_OF)
-                self._initialise(exchange, variance)
+                self._initialise(exchange)
             return False
-        self._limit_offset(*self._measure(x, P, z, variance))
+        self._recent.append(exchange)
+        x, P = self._measure(x, P, (exchange.offset_ns - self._base_ns) / 1e3, variance)
+        if not low <= x[0] <= high:
+            nearest = min(max(float(x[0]), low), high)
+            shift = nearest - float(x[0])
+            x, P = self._measure(x, P, nearest, _EXACT * P[0, 0])
+            P = P + np.diag([shift**2, 0.0])
+        self._x, self._P = x, P
+        self._bound_us = max(float(x[0]) - low, high - float(x[0]))
         self._consecutive_rejects = 0
         self._agreeing_exchanges += 1
         return True
@@ -188,20 +201,19 @@ class ClockFilter:
         x, P = self._kalman.update(x, P, z, np.array([[variance]]), np.array([[1.0, 0.0]]))
         return x, P
 
-    def _limit_offset(self, x: F64, P: F64) -> None:
-        """Keep the offset within the error bounds of all recent exchanges. Where one side waits for a core
-        again and again, exchanges err in one direction, and the filter alone would leave the bounds."""
-        times, offsets, delays = np.array([(e.middle_ns, e.offset_ns, e.delay_ns) for e in self._recent]).T
+    def _offset_bounds_us(self, exchange: Exchange) -> tuple[float, float]:
+        """Return the least and the largest offset at `_updated_ns` that this and all recent exchanges allow.
+
+        A filter alone would leave them where one side waits for a core again and again: exchanges then err in
+        one direction."""
+        exchanges = [*self._recent, exchange]
+        times, offsets, unverified = np.array(
+            [(e.middle_ns, e.offset_ns, e.unverified_ns) for e in exchanges]
+        ).T
         age_s = np.abs(times - self._updated_ns) / SECOND_NS
-        error_us = delays / 2e3 + DRIFT_PPM * age_s
+        error_us = unverified / 2e3 + DRIFT_PPM * age_s
         offset_us = (offsets - self._base_ns) / 1e3
-        low, high = float((offset_us - error_us).max()), float((offset_us + error_us).min())
-        nearest = min(max(float(x[0]), low), high)
-        if low <= high and nearest != x[0]:
-            shift = nearest - float(x[0])
-            x, P = self._measure(x, P, nearest, 1e-6 * P[0, 0])
-            P = P + np.diag([shift**2, 0.0])
-        self._x, self._P = x, P
+        return float((offset_us - error_us).max()), float((offset_us + error_us).min())
 
     def _predict(self, x: F64, now_ns: int) -> tuple[F64, F64]:
         """Return state (2,) and covariance (2, 2) at `now_ns`, with random walks of offset and drift."""

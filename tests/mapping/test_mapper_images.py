@@ -17,7 +17,9 @@ from helpers.textured_planes import CAMERA, T_BODY_CAM, Planes
 from share.config import Config, ControlConfig, MergeConfig
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
+from share.mapping.candidates import MAX_BACKLOG_CANDIDATES
 from share.mapping.graph.solver import PoseGraphSolver
+from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, SaveKeyframe, SaveRun, SaveView
 from share.mapping.mapper import Mapper
 from share.mapping.recognition.verification import Verification
@@ -116,6 +118,20 @@ def test_two_agents_join_by_their_images_and_are_then_aligned_by_the_map(place: 
             assert np.linalg.norm(off[3:]) < 0.004
             assert np.degrees(np.linalg.norm(off[:3])) < 0.15
     assert mapper.report()["failed_steps"] == 0
+
+
+@pytest.mark.long
+def test_a_pending_merge_does_not_end_a_search_while_others_wait(place: Planes) -> None:
+    """It needs loops of several keyframes on both sides, and soon: those at hand may be all there will be."""
+    mapper = mapper_of("ann", "bob")
+    for _, sent in keyframes(place, -0.1, 1):
+        mapper.add_keyframe("ann", sent)
+    work(mapper)
+    for _, sent in keyframes(place, 0.0, 2, steps=2):
+        mapper.add_keyframe("bob", sent)
+    newest = [step for step, _ in work(mapper) if isinstance(step, VerifyStep)][:MAX_BACKLOG_CANDIDATES]
+    assert [mapper.atlas.key(step.node_id) for step in newest] == [KeyframeKey("bob", 1)] * len(newest)
+    assert mapper.atlas.map_sizes() == {"ann/0": 6}
 
 
 @pytest.mark.long

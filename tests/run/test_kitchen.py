@@ -75,20 +75,19 @@ def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
     assert joint.joint.rmse <= 0.06
     assert joint.joint.n > 250  # of 500: from the moment on that the map was shared
     corrections = [event for event in _events(tmp_path) if event["event"] == "correction"]
-    assert corrections
+    assert len(corrections) > 3
     assert all(event["reason"] for event in _events(tmp_path))
     for name in agents:
         assert (tmp_path / name / "odom.tum").read_bytes() == tracked[name]
         own = json.loads((tmp_path / name / "report.json").read_text())
         # the last may come when the agent has said goodbye
         assert 0 <= sum(event["agent"] == name for event in corrections) - own["corrections"] <= 1
-        assert own["corrections"] > 1
+        assert own["corrections"] >= 1
         assert report["agents"][name]["keyframes"] == own["sent"] <= own["keyframes"]
         assert own["corrected_ms"]["n"] > 0
         clock = own["clock"]  # of one machine with itself: the truth is 0
         estimate_ms = own["protocol"]["clock_offset_ns"] / 1e6
-        busy_ms = 0.5  # by which either side may wait for a core; the bound itself is tested in virtual time
-        assert abs(estimate_ms) <= clock["asymmetry_ms"] + 4 * clock["sigma_ms"] + busy_ms
+        assert abs(estimate_ms) <= clock["asymmetry_ms"] + 1e-3  # however long either side waits for a core
         assert clock["is_reliable"] == (clock["uncertainty_ms"] <= 1.0) == (clock["offset_ms"] is not None)
         assert "clock of the edge: " in agents[name].said
 
