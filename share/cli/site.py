@@ -103,7 +103,7 @@ def site(
     token = served.check(bind, False)
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
-        remote = None if ray is None else _join(stack, ray)
+        remote = None if ray is None else _join(stack, ray, stderr)
         if remote is not None:
             plan = replace(plan, folder=plan.folder.absolute())
         link = stack.enter_context(closing(bind_link(bind, key_pair, MAX_FRAME_BYTES)))
@@ -121,14 +121,14 @@ def site(
     click.echo(json.dumps(report) if as_json else run_summary(report))
 
 
-def _join(stack: ExitStack, address: str) -> RemoteRooms:
+def _join(stack: ExitStack, address: str, stderr: Stderr) -> RemoteRooms:
     """Join a Ray cluster. Raises UsageError, ShareError."""
     from contextlib import closing
 
-    from share.runtime.ray_cluster import RayCluster
+    from share.runtime.cluster_process import ClusterProcess
     from share.runtime.remote_room import RemoteRooms
 
-    return RemoteRooms(stack.enter_context(closing(RayCluster(address))).start_worker)
+    return RemoteRooms(stack.enter_context(closing(ClusterProcess(address, stderr.print_line))).start_worker)
 
 
 def _room_setup(

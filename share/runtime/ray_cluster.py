@@ -6,11 +6,13 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import itertools
+import logging
 import os
 import re
 import socket
 import threading
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,12 +59,15 @@ class RayWorker:
 
     def call(self, method: str, *arguments: Any, timeout_s: float | None = None) -> Any:
         """See `WorkerHandle`."""
+        return read_answer(self.exchange(request_bytes(method, arguments), timeout_s))
+
+    def exchange(self, request: bytes, timeout_s: float | None) -> bytes:
+        """Return the answer to a request. Raises WorkerLostError."""
         if self._is_ended:
             raise WorkerLostError("has ended the room")
         errors = self._ray.exceptions
         try:
-            answer = self._host.call.remote(self._room, request_bytes(method, arguments))
-            answer = self._ray.get(answer, timeout=timeout_s)
+            answer: bytes = self._ray.get(self._host.call.remote(self._room, request), timeout=timeout_s)
         except errors.GetTimeoutError:
             raise WorkerLostError(f"has not answered for {timeout_s:g} s") from None
         except errors.RayError as error:
@@ -70,7 +75,7 @@ class RayWorker:
             raise WorkerLostError(_why_lost(str(error))) from None
         except (OSError, RuntimeError, ValueError) as error:  # the cluster is gone
             raise WorkerLostError(f"cannot be reached: {describe_exception(error)}") from None
-        return read_answer(answer)
+        return answer
 
     def kill(self) -> None:
         """End the room. Does not wait."""
@@ -86,10 +91,11 @@ class RayCluster:
     """A Ray cluster that this process has joined, until `close`. Raises UsageError, ShareError.
 
     address: HOST:PORT of a running one, of which this machine is part; auto: the one that runs on this
-    machine; local: one that is started here, for tries.
+    machine; local: one that is started here, for tries. on_answer: called whenever the head has answered.
+    Ray ends this process a minute after the head is gone (`share.runtime.cluster_process`).
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, on_answer: Callable[[], None] = lambda: None) -> None:
         if importlib.util.find_spec("ray") is None:
             raise UsageError(f"--ray: {install_hint('ray', 'site')}")
         _check_address(address)
@@ -105,6 +111,7 @@ class RayCluster:
         where: dict[str, Any] = {"address": address}
         if address == "local":
             where |= {"include_dashboard": False, "object_store_memory": _LOCAL_STORE_BYTES}
+        logging.getLogger("ray").setLevel(logging.ERROR)
         try:
             ray.init(**where, log_to_driver=False, logging_level="ERROR", configure_logging=False)
         except Exception as error:
@@ -112,6 +119,7 @@ class RayCluster:
         self._host_class = ray.remote(RoomHost)
         self._hosts: dict[str, Any] = {}  # by machine
         self._numbers = itertools.count()
+        self._on_answer = on_answer
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._keep_hosts, name="room hosts", daemon=True)
         self._thread.start()
@@ -127,6 +135,7 @@ class RayCluster:
         while True:
             with contextlib.suppress(Exception):  # said when a room is to start
                 for machine in self._machines():
+                    self._on_answer()
                     if machine.places and _is_reachable(machine.address, machine.port):
                         self._host(machine)
             if self._closing.wait(_LOOK_S):

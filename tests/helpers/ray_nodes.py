@@ -15,9 +15,9 @@ _STORE_BYTES = 80 * 2**20
 
 
 class RayNodes:
-    """A head on which no room runs, and nodes that can be killed; until `close`."""
+    """A head on which no room runs, and nodes that can be killed; until `close`. port: of the head."""
 
-    def __init__(self, cpus: list[int]) -> None:
+    def __init__(self, cpus: list[int], port: int | None = None) -> None:
         os.environ["RAY_AUTH_MODE"] = "disabled"  # else it makes a token in the home folder
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"
@@ -27,6 +27,8 @@ class RayNodes:
                 "ray.cluster_utils", reason="ray is not installed: pip install 'share-slam[site]'"
             )
         head = {"num_cpus": 0, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
+        if port is not None:
+            head["gcs_server_port"] = port
         self._cluster = cluster_utils.Cluster(initialize_head=True, head_node_args=head)
         self.nodes = [self.add(one) for one in cpus]
 
@@ -43,6 +45,10 @@ class RayNodes:
         while (used := sum(map(cpu_s, self.pids(node)))) - before > 0.3:
             before = used
             time.sleep(1.5)
+
+    def kill_all(self) -> None:
+        for node in [self._cluster.head_node, *self.nodes]:
+            self.kill(node)
 
     def kill(self, node: Any) -> None:
         """Kill all its processes, as when its machine loses power."""

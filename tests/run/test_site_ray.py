@@ -4,6 +4,7 @@ nothing that was acknowledged is lost. Needs Ray."""
 from __future__ import annotations
 
 import json
+import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -40,22 +41,36 @@ def start_site(folder: Path, ray: str) -> tuple[Child, str]:
     return site, site.wait_for(r"listening on (tcp://\S+?),", 60)[1]
 
 
+def start_walkers(address: str, frames: int) -> list[Walker]:
+    place = walls(1)
+    people = [Person(name, place, 0.5 * i, 11 * (i + 1)) for i, name in enumerate(NAMES)]
+    scripts = [to_and_fro(script(person, 301), frames) for person in people]
+    walkers = [Walker(p.hello, way, address) for p, way in zip(people, scripts, strict=True)]
+    for walker in walkers:
+        walker.start()
+    for walker in walkers:
+        until(f"{walker.name} is corrected", lambda w=walker: w.lives and w.lives[-1].corrected)
+    return walkers
+
+
+def finish(walkers: list[Walker]) -> None:
+    for walker in walkers:
+        walker.finish()
+    for walker in walkers:
+        walker.join(FOUND_S)
+        assert not walker.is_alive()
+        assert walker.error is None
+
+
 @pytest.mark.slow
 def test_nodes_are_killed_with_rooms_on_them(tmp_path: Path) -> None:
     rounds = 2
-    place = walls(1)
-    people = [Person(name, place, 0.5 * i, 11 * (i + 1)) for i, name in enumerate(NAMES)]
-    scripts = [to_and_fro(script(person, 301), 600 + 400 * rounds) for person in people]
     nodes = RayNodes([2, 2])  # eight rooms fit on each
     try:
         for node in nodes.nodes:
             nodes.settle(node)
         site, address = start_site(tmp_path, nodes.address)
-        walkers = [Walker(p.hello, way, address) for p, way in zip(people, scripts, strict=True)]
-        for walker in walkers:
-            walker.start()
-        for walker in walkers:
-            until(f"{walker.name} is corrected", lambda w=walker: w.lives and w.lives[-1].corrected)
+        walkers = start_walkers(address, 600 + 400 * rounds)
         memory = [round(memory_mb(nodes.pids(node))) for node in nodes.nodes]
         print(f"MB of two nodes with five rooms: {memory}, of the front: {memory_mb([site.process.pid]):.0f}")
         seconds: list[float] = []
@@ -64,12 +79,7 @@ def test_nodes_are_killed_with_rooms_on_them(tmp_path: Path) -> None:
             print(
                 f"kill {i}: {len(took)} rooms, answered again after {np.round(sorted(took), 2)} s", flush=True
             )
-        for walker in walkers:
-            walker.finish()
-        for walker in walkers:
-            walker.join(FOUND_S)
-            assert not walker.is_alive()
-            assert walker.error is None
+        finish(walkers)
         began = time.monotonic()
         assert site.interrupt(90) == 0
         print(f"the site ended after {time.monotonic() - began:.1f} s")
@@ -81,6 +91,40 @@ def test_nodes_are_killed_with_rooms_on_them(tmp_path: Path) -> None:
     assert report["internal_errors"] == 0
     text = f"median {np.median(seconds):.2f}, p95 {np.quantile(seconds, 0.95):.2f}, most {max(seconds):.2f}"
     print(f"{rounds} kills, {len(seconds)} rooms lost; answered again after s: {text}")
+
+
+@pytest.mark.slow
+def test_the_whole_cluster_is_lost_and_comes_back(tmp_path: Path) -> None:
+    """Ray would end a process that has joined a minute after its head is gone: the front goes on."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = int(server.getsockname()[1])
+    nodes = RayNodes([2], port)
+    try:
+        nodes.settle(nodes.nodes[0])
+        site, address = start_site(tmp_path, nodes.address)
+        walkers = start_walkers(address, 2500)
+        lives = [len(walker.lives) for walker in walkers]
+        nodes.kill_all()
+        site.wait_for("the Ray cluster is gone, and all rooms on it", 60)
+        time.sleep(75.0)
+        assert site.process.poll() is None
+        nodes.close()
+        nodes = RayNodes([2], port)
+        site.wait_for("the Ray cluster is joined again", 120)
+        for walker, before in zip(walkers, lives, strict=True):
+            until(f"{walker.name} is welcomed", lambda w=walker, n=before: len(w.lives) > n)
+            until(f"{walker.name} is corrected", lambda w=walker: w.lives[-1].corrected is not None)
+        finish(walkers)
+        nodes.kill_all()
+        began = time.monotonic()
+        assert site.interrupt(60) == 0
+        print(f"the site, whose cluster is gone, ended after {time.monotonic() - began:.1f} s")
+        assert "FATAL" not in site.said and "rpc_client.h" not in site.said
+    finally:
+        nodes.close()
+    for walker in walkers:
+        check(walker, tmp_path)
+    assert json.loads((tmp_path / "out" / "edge.json").read_text())["internal_errors"] == 0
 
 
 def to_and_fro(way: Script, frames: int) -> Script:

@@ -28,9 +28,9 @@ from share.config import Config  # noqa: E402
 from share.geometry.camera import Camera, ImuNoise, Rig  # noqa: E402
 from share.mapping.map_changes import SaveKeyframe, SaveRun  # noqa: E402
 from share.protocol.edge_events import AddKeyframe, AddRun  # noqa: E402
+from share.runtime.cluster_process import ClusterProcess  # noqa: E402
 from share.runtime.keyframe_handover import KeyframesAdded  # noqa: E402
 from share.runtime.mapper_process import StartMapper, start_mapper_process  # noqa: E402
-from share.runtime.ray_cluster import RayCluster  # noqa: E402
 from share.runtime.remote_room import RemoteRooms  # noqa: E402
 from share.store.map_store import MapStore  # noqa: E402
 from share.types import AgentKind, Keyframe, KeyframeImage, View  # noqa: E402
@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="folder on the disk to measure")
     options = parser.parse_args()
     keyframes = [_keyframe(i) for i in range(options.keyframes + _WARM)]
-    cluster = RayCluster("local")
+    cluster = ClusterProcess("local")
     remote = RemoteRooms(cluster.start_worker)
     print(json.dumps({"answer": _answers(remote, keyframes)}), flush=True)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:

@@ -1,0 +1,2 @@
+def NodeAffinitySchedulingStrategy(node: str, soft: bool) -> str:
+    return node
