@@ -105,7 +105,8 @@ def edge(
     is_streamed = settings.edge.policy == STREAMED
     if is_streamed and map_file is not None:
         raise UsageError("--map: policy streamed builds no map; leave it out, or choose another policy")
-    served = PageOptions(http, view, headset, headset_cert, headset_key, mounts, http_token, out)
+    views = {} if view is None else {"": view}
+    served = PageOptions(http, views, headset, headset_cert, headset_key, mounts, http_token, out)
     token = served.check(bind, is_streamed)
     max_message_bytes = MAX_IMAGE_BYTES if is_streamed else MAX_FRAME_BYTES
     with ExitStack() as stack:

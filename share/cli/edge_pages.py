@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,10 +24,11 @@ if TYPE_CHECKING:
 
 
 class PageOptions(NamedTuple):
-    """The pages that the edge serves. out: folder for measurements of headset pages."""
+    """The pages that the edge serves. views: addresses of live rooms, by room of a site; "": of an edge. out:
+    folder for measurements of headset pages."""
 
     http: str | None
-    view: str | None
+    views: Mapping[str, str]
     headset: str | None
     certificate: Path | None
     certificate_key: Path | None
@@ -45,7 +47,7 @@ class PageOptions(NamedTuple):
             raise UsageError(
                 "--headset: policy streamed builds no map; leave it out, or choose another policy"
             )
-        if self.token_file is not None and self.http is None and self.view is None:
+        if self.token_file is not None and self.http is None and not self.views:
             raise UsageError("--http-token: it is for --http or --view; give one of them, or leave it out")
         token = None if self.token_file is None else read_token(self.token_file)
         named: dict[str, Address] = {}
@@ -62,7 +64,8 @@ class PageOptions(NamedTuple):
         from share.net.transport import parse_address
 
         addresses = {"--bind": parse_address(bind, bind=True)}
-        for option, text in (("--http", self.http), ("--view", self.view)):
+        guarded = {"--http": self.http, **{view_option(room): text for room, text in self.views.items()}}
+        for option, text in guarded.items():
             if text is not None:
                 addresses[option] = http_address(option, text, token)
         if self.headset is not None:
@@ -70,6 +73,11 @@ class PageOptions(NamedTuple):
 
             addresses["--headset"], _ = page_address(self.headset)
         return addresses
+
+
+def view_option(room: str) -> str:
+    """Return the option with which a live room is asked for, for messages. room: "" of an edge."""
+    return f"--view {room}" if room else "--view"
 
 
 def edge_access(endpoint: str, keys: EdgeKeys | None, allowed: frozenset[Permission]) -> EdgeAccess:
@@ -113,7 +121,7 @@ class EdgePages:
         self.observers: list[EdgeObserver] = []
         self._stack, self._token_file = stack, served.token_file
         self._stderr, self._addresses, self._is_guarded = stderr, list[str](), token is not None
-        self._room: LiveRoom | None = None
+        self._live_rooms: dict[str, LiveRoom] = {}  # by room; "" without rooms
         self._plans: dict[str, RoomPlan] = {}  # by room; "" without rooms
         self._headset: HeadsetPage | None = None
         if served.http is not None:
@@ -122,11 +130,14 @@ class EdgePages:
             self._plans = {room: RoomPlan() for room in rooms or ("",)}
             self.observers += [] if rooms else self._plans.values()
             self._addresses.append(f"status at http://{status.endpoint}/")
-        if served.view is not None:
-            self._room = LiveRoom(served.view, token, "SHARE edge", stderr.print_line)
-            stack.callback(self._room.close)
-            self.observers.append(self._room.feed)
-            self._addresses.append(f"live room at http://{self._room.endpoint}/")
+        for room, address in served.views.items():
+            title = f"SHARE {room}" if room else "SHARE edge"
+            live_room = LiveRoom(address, token, title, stderr.print_line)
+            stack.callback(live_room.close)
+            self._live_rooms[room] = live_room
+            self.observers += [] if room else [live_room.feed]
+            of_room = f" of '{room}'" if room else ""
+            self._addresses.append(f"live room{of_room} at http://{live_room.endpoint}/")
         if served.headset is not None and access is not None:
             self._add_headset(served.headset, access, served)
 
@@ -150,7 +161,8 @@ class EdgePages:
 
     def room_observers(self, room: str) -> list[EdgeObserver]:
         """Return the observers of one room of a site."""
-        return [self._plans[room]] if room in self._plans else []
+        plan, live_room = self._plans.get(room), self._live_rooms.get(room)
+        return [*([plan] if plan else []), *([live_room.feed] if live_room else [])]
 
     def _plan(self) -> dict[str, Any]:
         """Return /plan.json."""
@@ -161,9 +173,16 @@ class EdgePages:
 
     def _report(self) -> dict[str, Any]:
         """Return the report of the edge, if it runs yet, with what its pages tell that live."""
-        report = {"loading": "starting"} if self.run is None else self.run.report()
-        if self._room is not None and self._room.is_alive:
-            report = report | {"live_room": self._room.endpoint}
+        report: dict[str, Any] = {"loading": "starting"} if self.run is None else self.run.report()
+        live_rooms = {room: one.endpoint for room, one in self._live_rooms.items() if one.is_alive}
+        if (endpoint := live_rooms.get("")) is not None:
+            report = report | {"live_room": endpoint}
+        elif live_rooms and "rooms" in report:
+            rooms = {
+                room: one | ({"live_room": live_rooms[room]} if room in live_rooms else {})
+                for room, one in report["rooms"].items()
+            }
+            report = report | {"rooms": rooms}
         if self._headset is not None and self._headset.is_alive:
             report = report | {"headset": self._headset.shown_report(self._is_guarded)}
         return report

@@ -32,6 +32,13 @@ if TYPE_CHECKING:
 @options.policy
 @options.keys
 @edge_options.http
+@click.option(
+    "--view",
+    "views",
+    metavar="ROOM=[H:]P",
+    multiple=True,
+    help="Show this room live in 3D here (needs viser); repeatable.",
+)
 @edge_options.http_token
 @edge_options.allow
 @edge_options.out
@@ -51,6 +58,7 @@ def site(
     policy: str | None,
     keys: Path | None,
     http: str | None,
+    views: tuple[str, ...],
     http_token: Path | None,
     allow: tuple[str, ...],
     out: Path | None,
@@ -99,7 +107,7 @@ def site(
     plan = read_rooms(rooms_file)
     key_pair = edge_keys_for(keys, parse_address(bind, bind=True).local)
     allowed = allowed_without_keys(allow, key_pair is not None)
-    served = PageOptions(http, None, None, None, None, (), http_token, out)
+    served = PageOptions(http, _view_addresses(views, plan), None, None, None, (), http_token, out)
     token = served.check(bind, False)
     with ExitStack() as stack:
         stderr = stack.enter_context(closing(Stderr()))
@@ -119,6 +127,21 @@ def site(
             pages.print_addresses()
             report = run.run()
     click.echo(json.dumps(report) if as_json else run_summary(report))
+
+
+def _view_addresses(views: tuple[str, ...], plan: SitePlan) -> dict[str, str]:
+    """Return the addresses of live rooms by room. Raises UsageError."""
+    addresses: dict[str, str] = {}
+    for view in views:
+        room, equals, address = view.rpartition("=")
+        if not equals:
+            raise UsageError(f"--view {view}: give ROOM=PORT or ROOM=HOST:PORT")
+        if room not in plan.rooms:
+            raise UsageError(f"--view {view}: there is no room '{room}'; there are {', '.join(plan.rooms)}")
+        if room in addresses:
+            raise UsageError(f"--view {view}: room '{room}' is shown already; give it once")
+        addresses[room] = address
+    return addresses
 
 
 def _join(stack: ExitStack, address: str, stderr: Stderr) -> RemoteRooms:

@@ -59,7 +59,6 @@ class EdgeRun:
         """rooms: of a site, each with what is its own; then `settings`, `store` and `blinding` are of none.
         remote: see `SiteRooms`. Raises StoreError if a map is unreadable."""
         self._allowed, self._link, self._on_record = frozenset(allowed), link, on_record
-        self._observer = EdgeObservers(*observers)
         self._poses_shown_s = self._report_shown_s = 0.0  # to the observer, monotonic
         self._write_failures: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._files = EdgeFiles(out, self._write_failures.put)
@@ -78,7 +77,13 @@ class EdgeRun:
             self._room = SiteRooms(self, rooms, self._start_ns, has_keys, remote=remote)
         else:
             self._room = ServedRoom(
-                settings, self, self._start_ns, store, self._observer, blinding or NoBlinding(), has_keys
+                settings,
+                self,
+                self._start_ns,
+                store,
+                EdgeObservers(*observers),
+                blinding or NoBlinding(),
+                has_keys,
             )
 
     def stop(self) -> None:
@@ -171,7 +176,7 @@ class EdgeRun:
             self._room.show_poses()
         if now_s - self._report_shown_s >= _REPORT_SHOWN_S:
             self._report_shown_s = now_s
-            self._observer.add_report(self._report)
+            self._room.show_report(self._report)
 
     # ------------------------------------------------------------------ the room's host
 

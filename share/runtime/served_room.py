@@ -203,6 +203,10 @@ class ServedRoom:
         """Show the observer the newest pose of each present run."""
         self._observer.add_poses(self._state_machine.latest_poses())
 
+    def show_report(self, report: Mapping[str, Any]) -> None:
+        """Show the observer edge.json as it is now."""
+        self._observer.add_report(report)
+
     def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of edge.json."""
         return self._blinding.covered_series(self._state_machine.series())

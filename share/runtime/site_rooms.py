@@ -91,6 +91,7 @@ class SiteRooms:
         self._refusals = Throttle(1.0, 5.0)
         self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
         self._rooms: dict[str, RoomKeeper] = {}
+        self._reports: dict[str, dict[str, Any]] = {}  # the last ones
         self._ports: dict[str, RoomPort] = {}
         self._switch = RoomSwitch(self._ports, lambda room, name: self._setups[room].allows(name))
         try:
@@ -214,13 +215,18 @@ class SiteRooms:
         for room in self._rooms.values():
             room.show_poses()
 
+    def show_report(self, report: Mapping[str, Any]) -> None:
+        """Show the observer of each room what the last `report` says of it."""
+        for name, room_report in self._reports.items():
+            self._setups[name].observer.add_report(room_report)
+
     def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of each room."""
         return {name: room.series() for name, room in self._rooms.items()}
 
     def report(self) -> dict[str, Any]:
         """Return edge.json of the whole site."""
-        reports = {name: room.report() for name, room in self._rooms.items()}
+        self._reports = reports = {name: room.report() for name, room in self._rooms.items()}
         directory = {"keyframes": len(self._directory), "waiting": self._thread.pending_jobs}
         report = site_report(reports, self._switch.building.poses)
         trouble = [*report["trouble"], *filter(None, [self._guard.trouble])]

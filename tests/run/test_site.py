@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import urllib.request
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from helpers.children import Child, start_agent
 
+from share.cli.main import cli
+from share.errors import UsageError
 from share.metrics.ate import ate
 from share.recordings.trajectory import read_tum
 
@@ -72,6 +77,37 @@ def test_what_is_wrong_with_a_rooms_file_is_a_line(tmp_path):
     assert site.said.count("\n") == 1
     assert "have the same map; give each its own" in site.said
     assert not (tmp_path / "a.sqlite").exists()
+
+
+@pytest.mark.parametrize(
+    ("views", "line"),
+    [
+        (["8081"], "--view 8081: give ROOM=PORT or ROOM=HOST:PORT"),
+        (["attic=8081"], "--view attic=8081: there is no room 'attic'; there are hall, kitchen"),
+        (["hall=8081", "hall=8082"], "--view hall=8082: room 'hall' is shown already; give it once"),
+        (["hall=8081", "kitchen=8081"], "--view hall and --view kitchen name the same port 8081"),
+        (["hall=a b:1"], "'a b:1' is not an address to serve at"),
+    ],
+)
+def test_a_view_that_cannot_be_is_a_line(tmp_path, views, line):
+    (tmp_path / "rooms.yaml").write_text(ROOMS)
+    options = [part for view in views for part in ("--view", view)]
+    result = CliRunner().invoke(cli, ["site", "--rooms", str(tmp_path / "rooms.yaml"), *options])
+    assert isinstance(result.exception, UsageError)
+    assert line in str(result.exception)
+
+
+@pytest.mark.skipif(find_spec("viser") is None, reason="viser is not installed")
+def test_a_room_is_shown_live(tmp_path):
+    (tmp_path / "rooms.yaml").write_text(ROOMS)
+    arguments = "--rooms", str(tmp_path / "rooms.yaml"), "--bind", "tcp://127.0.0.1:0", "--http", "0"
+    site = Child(tmp_path / "site.log", "site", *arguments, "--view", "kitchen=0")
+    page = site.wait_for(r"status at (http://\S+/)", 60)[1]
+    live = site.wait_for(r"live room of 'kitchen' at http://(\S+)/", 60)[1]
+    rooms = json.loads(urllib.request.urlopen(f"{page}snapshot.json").read())["rooms"]
+    assert {name: room.get("live_room") for name, room in rooms.items()} == {"hall": None, "kitchen": live}
+    assert b"viser" in urllib.request.urlopen(f"http://{live}/").read().lower()
+    assert site.interrupt() == 0
 
 
 def test_no_room_is_served_if_one_cannot_be(tmp_path):

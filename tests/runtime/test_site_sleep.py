@@ -93,6 +93,29 @@ def test_a_mistake_in_one_room_is_said_and_costs_the_others_nothing(monkeypatch)
     assert all(room.room.is_closed for room in site._rooms.values())
 
 
+def test_each_room_is_shown_its_own_report(monkeypatch) -> None:
+    monkeypatch.setattr(site_rooms, "ServedRoom", Room)
+    seen = dict[str, Any]()
+
+    class Observer(EdgeObservers):
+        def __init__(self, room: str) -> None:
+            super().__init__()
+            self._room = room
+
+        def add_report(self, report: Any) -> None:
+            seen[self._room] = report
+
+    setups = [RoomSetup(name, Config(), None, Observer(name)) for name in ("hall", "lab")]
+    site = SiteRooms(Host(), setups, time.monotonic_ns(), False)
+    site.show_report({})
+    assert seen == {}  # there is none yet
+    whole = site.report()
+    site.show_report(whole)
+    assert seen.keys() == {"hall", "lab"}
+    assert all("rooms" not in report and report["session"] == 7 for report in seen.values())
+    site.close()
+
+
 def one_run(room: str) -> list[Any]:
     key = f"{room}-0003"
     return [run(key), *(keyframe(key, i, first=i == 0) for i in range(20))]
