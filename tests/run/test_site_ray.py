@@ -114,6 +114,8 @@ def test_the_whole_cluster_is_lost_and_comes_back(tmp_path: Path) -> None:
         for walker, before in zip(walkers, lives, strict=True):
             until(f"{walker.name} is welcomed", lambda w=walker, n=before: len(w.lives) > n)
             until(f"{walker.name} is corrected", lambda w=walker: w.lives[-1].corrected is not None)
+        for walker in walkers:  # of more than a minute
+            until(f"all of {walker.name} is kept", lambda w=walker: w.machine.report()["pending"] <= 1, 120.0)
         finish(walkers)
         nodes.kill_all()
         began = time.monotonic()
