@@ -43,6 +43,7 @@ def print_access(stderr: Stderr, keys: EdgeKeys | None, allowed: Collection[str]
 
 
 _SHOWN_EVENTS: set[EventKind] = {  # without -v
+    "internal error",
     "agent joined",
     "left",
     "reconnected",

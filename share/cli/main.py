@@ -87,6 +87,10 @@ def main(arguments: list[str] | None = None) -> None:
             sys.stdout.close()
         _exit_with(f"{error.filename or 'cannot write the output'}: {error.strerror or error}", 1)
     except Exception as error:  # a mistake of SHARE's; -v says where
+        if "can't start new thread" in str(error):
+            _exit_with(
+                "this machine lets SHARE start no further thread; raise its limit (ulimit -u, TasksMax)", 1
+            )
         verbosity.explain(error)
         hint = "" if verbosity.is_on else "; repeat the command with -v, and report what it prints"
         _exit_with(f"internal error: {describe_exception(error)}{hint}", 1)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from share.config import Config
-from share.errors import StoreError
+from share.errors import ShareError, StoreError, describe_exception
 from share.event_kinds import EventKind
 from share.net.transport import EdgeLink
 from share.protocol.edge_events import PeerMessageReceived
@@ -68,6 +68,7 @@ class EdgeRun:
         self._refused_handshakes: Counter[str] = Counter()  # by refusal line
         self._report: dict[str, Any] = {}
         self._report_due_s = self._reported_s = 0.0  # next and last report, monotonic s
+        self._report_failure: str | None = None  # why the last one could not be made
         self._heap = HeapTrimmer()
         self._guard = FaultGuard(lambda text: self.log_event("internal error", text))
         has_keys = link.agent_names("") is not None
@@ -107,6 +108,8 @@ class EdgeRun:
             self._files.check()
         if self._incomplete_reason is not None:
             raise StoreError(self._incomplete_reason)
+        if self._report_failure is not None:
+            raise ShareError(f"edge.json is not of the end: {self._report_failure}")
         return self._report
 
     def close(self) -> None:
@@ -124,7 +127,8 @@ class EdgeRun:
         report, late_s = self._report, time.monotonic() - self._reported_s - _REPORT_S
         if not report or late_s < _STALE_REPORT_S:
             return report
-        stuck = f"the edge has been stuck for {late_s:.0f} s; all values shown are that old"
+        cause = self._report_failure or "the edge has been stuck"
+        stuck = f"{cause}: all values shown are {late_s:.0f} s old"
         return {**report, "trouble": [stuck, *report["trouble"]]}
 
     # ------------------------------------------------------------------ the loop
@@ -150,9 +154,13 @@ class EdgeRun:
         self._show_state(time.monotonic(), has_news)
 
     def _try_to_report(self) -> None:
-        """Update the report. A failure costs this report, and `report` shows it as stale."""
-        with self._guard.step("a report"):
+        """Update the report. A failure costs this report, and `report` says so."""
+        try:
             self._update_report()
+            self._report_failure = None
+        except Exception as error:
+            self._report_failure = f"no report can be made ({describe_exception(error)})"
+            self._guard.record("a report", error)
 
     def _update_report(self) -> None:
         """Make a report and set when the next is due."""

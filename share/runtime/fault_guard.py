@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 import traceback
@@ -56,4 +57,5 @@ class FaultGuard:
             self._newest, self._newest_s = kind, time.monotonic()
             line = self._lines.admit_new(text, time.monotonic_ns(), kind)
         if line is not None:
-            self._notify(line)
+            with contextlib.suppress(Exception):  # what fails may be what it tells
+                self._notify(line)

@@ -83,6 +83,11 @@ class PlaceNewsBatch:
 
 
 @dataclass(frozen=True)
+class RestoreBegun:
+    """The mapper and its solver run, and restore the map: a death from now on may be caused by it."""
+
+
+@dataclass(frozen=True)
 class MapRestored:
     """All of `RestoreMap` is restored: a later death is not caused by the file's contents."""
 
@@ -117,7 +122,8 @@ def start_mapper_process(
 def run_mapper(inbox: Inbox, answer: Callable[[Any], None]) -> None:
     """Work of a `WorkerProcess`: takes StartMapper, then RestoreMap, AddRun, SetCredential, SetPresence,
     AddKeyframe, DropRun and FindKeyframe until END; answers KeyframesAdded, MapperResult, MapperReport,
-    MapRestored, SolverDied and KeyframeSought, and where there are other rooms PlaceNewsBatch."""
+    RestoreBegun, MapRestored, SolverDied and KeyframeSought, and where there are other rooms
+    PlaceNewsBatch."""
     solver = _start_solver(inbox, 0.0)
     if isinstance(start := inbox.get(), StartMapper):
         _MapperProcess(inbox, answer, start.mapper(), solver).run()
@@ -183,6 +189,7 @@ class _MapperProcess:
     def _handle(self, message: Any) -> None:
         match message:
             case RestoreMap():
+                self._answer(RestoreBegun())
                 self._mapper.restore(message.stored_map)
                 self._is_restoring, self._expire_due_s = True, 0.0
             case AddRun():

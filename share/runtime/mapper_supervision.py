@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from share.errors import ShareError
+from share.errors import ShareError, StoreError, brief_reason
 from share.mapping.map_changes import SaveObject, with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.mapper_process import MapperReport, RestoreMap
@@ -19,6 +19,7 @@ from share.timing import Backoff
 
 TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
 _SILENT_S = 5.0  # without a report of the mapper, which comes every second, it is stuck
+_MAX_START_S = 60.0  # for a mapper to restore a map and to report
 _MAX_SOLVE_S = 15.0  # for one solution; longer means the solver is stuck
 _MAX_TRIES = 3  # mappers that may die while restoring one map, before it is set aside
 _MAX_NAMES = 3  # of files, in a line
@@ -41,6 +42,7 @@ class MapperRestarts:
         self._known_m, self._notify, self._has_keys = known_m, notify, has_keys
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring, self._restored_keyframes = False, 0
+        self._has_begun = False  # the mapper runs, and restores the map
         self._tries = 0
         self._copies = [] if store is None else _copy_names(store.path)
         self._asides: list[str] = []  # a line each
@@ -77,20 +79,28 @@ class MapperRestarts:
             else {}
         )
 
+    def record_begun(self) -> None:
+        """Record that the mapper begins to restore the map. If it dies before, the machine lacks memory,
+        files or threads, and the map is not to blame."""
+        self._has_begun = True
+
     def record_restored(self) -> None:
         """Record that the mapper has restored the map."""
         self._is_restoring, self._tries = False, 0
 
-    def record_death(self, has_run: bool = True) -> float:
-        """Record that the mapper died. Return the seconds until the next may start. has_run: its process had
-        started; else the machine lacks memory or processes, and its map is not to blame."""
-        self._tries += self._is_restoring and has_run
+    def record_death(self) -> float:
+        """Record that the mapper died. Return the seconds until the next may start."""
+        self._tries += self._is_restoring and self._has_begun
+        return self.record_failure()
+
+    def record_failure(self) -> float:
+        """Record that no new session could be started. Return the seconds until the next try."""
         return self._backoff.record_failure(time.monotonic_ns())
 
     def load_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
         """Return the map for the mapper, and the agents' runs for a new session. Raises StoreError if the
         file is unreadable now."""
-        self._is_restoring = False
+        self._is_restoring = self._has_begun = False
         if self._tries >= _MAX_TRIES:
             self._set_aside(f"{self._tries} mappers in a row have died while restoring it")
         if self.store is None:
@@ -103,6 +113,8 @@ class MapperRestarts:
             self.objects = outline.objects if self.objects is None else self.objects
         except ShareError:
             raise
+        except (MemoryError, OSError) as error:  # of the machine, not of the file
+            raise StoreError(f"the map file cannot be read now: {brief_reason(error)}") from None
         except Exception as error:  # no content of a file may end the edge
             self._set_aside(f"{type(error).__name__}: {error}")
             return None, []
@@ -129,9 +141,12 @@ class MapperRestarts:
 
 
 class MapperProgress:
-    """The newest report of one mapper, {} before the first, and what follows from it about its progress."""
+    """The newest report of one mapper, {} before the first, and what follows from it about its progress.
 
-    def __init__(self) -> None:
+    start_delay_s: until it starts."""
+
+    def __init__(self, start_delay_s: float = 0.0) -> None:
+        self._silent_from_s = time.monotonic() + start_delay_s + _MAX_START_S
         self.report: dict[str, Any] = {}
         self.is_idle = False  # the mapper has nothing to do
         self._reported_s: float | None = None  # monotonic, as below
@@ -152,7 +167,9 @@ class MapperProgress:
     def stall(self) -> str | None:
         """Return which process makes no progress, None if both do."""
         if self._reported_s is None:
-            return None
+            late_s = time.monotonic() - self._silent_from_s
+            silent = f"the mapper has not reported for {late_s + _MAX_START_S:.0f} s since it was to start"
+            return f"{silent}: no corrections meanwhile" if late_s > 0.0 else None
         if (silent_s := time.monotonic() - self._reported_s) > _SILENT_S:
             return f"the mapper has not answered for {silent_s:.0f} s: no corrections meanwhile"
         if (solving_s := self._solving_s + silent_s) > _MAX_SOLVE_S:

@@ -16,10 +16,10 @@ _TIMEOUT_S = 5.0  # for the remaining jobs at the end
 
 
 class JobThread:
-    """Runs jobs in order. Jobs must not raise; the thread starts with the first one.
+    """Runs jobs in order. Jobs must not raise.
 
     on_idle: called whenever no job waits. Returns after how many seconds it is to be called again even if no
-    job comes, None: not.
+    job comes, None: not. Raises RuntimeError where no thread can be started: now, as none may be had later.
     """
 
     def __init__(self, name: str, on_idle: Callable[[], float | None] = lambda: None) -> None:
@@ -27,8 +27,8 @@ class JobThread:
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._busy_since: float | None = None
         self._is_ended = False
-        self._starting = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
 
     @property
     def pending_jobs(self) -> int:
@@ -43,13 +43,10 @@ class JobThread:
     def submit(self, job: Callable[[], None]) -> None:
         """Never waits. Safe from any thread."""
         self._jobs.put(job)
-        with self._starting:
-            if self._thread.ident is None:
-                self._thread.start()
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until all jobs submitted so far are done; within a job they are. Return False on timeout."""
-        if self._thread.ident in (None, threading.get_ident()):
+        if self._thread.ident == threading.get_ident():
             return True
         done = threading.Event()
         self.submit(done.set)

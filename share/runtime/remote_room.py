@@ -156,10 +156,6 @@ class RemoteMapper:
         self._sender = threading.Thread(target=self._run, name="to mapper", daemon=True)
         self._sender.start()
 
-    @property
-    def has_begun(self) -> bool:
-        return self._receiver is not None
-
     def send(self, message: Any) -> None:
         if isinstance(message, RestoreMap) and isinstance(message.rows, _Rows):
             message = RestoreFile(message.has_keys)

@@ -48,10 +48,6 @@ class RoomStore(Protocol):
 class MapperLink(Protocol):
     """The way to a mapper; see `share.runtime.worker_process.WorkerProcess`."""
 
-    @property
-    def has_begun(self) -> bool:
-        """Whether it could be started at all."""
-
     def send(self, message: Any) -> None: ...
 
     def close(self) -> None: ...

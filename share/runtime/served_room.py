@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from share.config import Config
-from share.errors import ShareError, StoreError, brief_reason
+from share.errors import StoreError, brief_reason, describe_exception
 from share.mapping.places import FindKeyframe, KeyframeSought
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
@@ -53,6 +53,7 @@ from share.runtime.mapper_process import (
     MapperReport,
     MapRestored,
     PlaceNewsBatch,
+    RestoreBegun,
     RestoreMap,
     SolverDied,
     StartMapper,
@@ -64,6 +65,8 @@ from share.runtime.room_parts import MapperLink, RoomStore, StartMapping
 from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
 from share.scheduling.policies import POLICIES
 
+# without one of these, mapper and file would lack what later ones build on
+_SESSION_EFFECTS = AddKeyframe, AddRun, SetCredential, SetPresence, DropRun, SaveChanges
 _DRAIN_S = 0.5  # wait for the map writer of a session that is over
 
 
@@ -105,7 +108,6 @@ class ServedRoom:
         self._observer, self._blinding, self._others = observer, blinding, others
         self._restarts = MapperRestarts(store, settings.merge.enter_m, self._log_map, has_keys)
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
-        self._restart_reason = ""
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._stopping = False
         self._troubles = RecentTroubles()
@@ -122,7 +124,7 @@ class ServedRoom:
         self.handle_answers()
         self.handle(Tick())
         if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
-            self._restart_mapping(self._restart_reason)
+            self._restart_session(self._restarts.record_failure())
 
     def stop(self) -> None:
         """From now on the death of a process is expected. Safe from any thread and from a signal handler."""
@@ -249,7 +251,7 @@ class ServedRoom:
 
         start_delay_s: delay of the mapper's start.
         """
-        self._progress = MapperProgress()
+        self._progress = MapperProgress(start_delay_s)
         self._mapper_process: MapperLink | None = None
         self._map_writer: MapWriter | None = None
         self._trackers = TrackerProcesses(self._settings, self._post)
@@ -280,40 +282,56 @@ class ServedRoom:
         )
         if self._others is not None:
             self._others.note_session()
-        has_others = self._others is not None
+        if store is not None and writable:
+            self._map_writer = MapWriter(store, self._post, self._post_map_notice)
+        try:
+            self._begin_mapper(restore, start_delay_s)
+        except BaseException:
+            if self._map_writer is not None:
+                self._map_writer.drain(_DRAIN_S)
+            raise
+
+    def _begin_mapper(self, restore: RestoreMap | None, start_delay_s: float) -> None:
+        store, has_others = self._restarts.store, self._others is not None
         map_file = None if store is None else store.path
         self._mapper_process = self._start_mapper(self._post, self._post_mapper_died, start_delay_s)
         self._mapper_process.send(StartMapper(self._settings, map_file, has_others))
         if restore is not None:
             self._mapper_process.send(restore)
         self._handover = KeyframeHandover(self._mapper_process.send)
-        if store is not None and writable:
-            self._map_writer = MapWriter(store, self._post, self._post_map_notice)
 
     def _restart_mapping(self, reason: str) -> None:
         """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
-        has_run = self._mapper_process is not None and self._mapper_process.has_begun
-        pause_s = self._restarts.record_death(has_run)
+        pause_s = self._restarts.record_death()
         text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
         self._host.log_event("mapper died", text)
         self._troubles.add(f"the mapper: {text}", pause_s + TROUBLE_SHOWN_S)
-        if self._mapper_process is not None:
-            self._mapper_process.close()
+        self._restart_session(pause_s, start_delay_s=pause_s)
+
+    def _restart_session(self, retry_s: float, start_delay_s: float = 0.0) -> None:
+        """End this session and start a new one; until the map can be read and a process started, nothing is
+        applied or acknowledged. start_delay_s: of the mapper."""
+        self._restart_due_s = time.monotonic() + retry_s  # whatever fails
         try:
+            if self._mapper_process is not None:
+                self._mapper_process.close()
             if self._map_writer is not None and not self._map_writer.drain(_DRAIN_S):
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
             self._restarts.objects = self._state_machine.room.kept_objects()
             self._restarts.forgotten = self._state_machine.forgotten_next_keyframes()
             loaded = self._load_stored_map()
-            self.end_totals()
-            self._start_session(loaded, pause_s)
+            self._try_to_end_totals()
+            self._start_session(loaded, start_delay_s)
             self._restart_due_s = None
-        except (ShareError, OSError, RuntimeError) as error:  # the disk; too many open files, or threads
-            # until the map can be read and a process started, nothing is applied or acknowledged
-            self._restart_reason = brief_reason(error)
-            self._log_map(f"{self._restart_reason}; retried in {pause_s:g} s")
-            self._restart_due_s = time.monotonic() + pause_s
+        except Exception as error:  # the disk; too many open files, or threads
+            self._log_map(f"{brief_reason(error)}; retried in {retry_s:g} s")
+
+    def _try_to_end_totals(self) -> None:
+        try:
+            self.end_totals()
+        except Exception as error:  # they are for people
+            self._host.log_event("internal error", f"totals of a session: {describe_exception(error)}")
 
     # ------------------------------------------------------------------ answers and effects
 
@@ -338,6 +356,8 @@ class ServedRoom:
                 self._others.note_sought(sought)
             case _MapNotice() as notice:
                 self._log_map(notice.text)
+            case RestoreBegun():
+                self._restarts.record_begun()
             case MapRestored():
                 self._restarts.record_restored()
                 self._host.expect_growth(False)
@@ -355,17 +375,34 @@ class ServedRoom:
                     self._log_map(notice.text)
 
     def execute(self, effects: Sequence[EdgeEffect]) -> None:
-        """Carry out effects of the state machine."""
-        for effect in effects:
-            self._execute(effect)
+        """Carry out effects of the state machine. One that fails does not cost the others; without one that
+        mapper or map file need, a new session begins. Raises the first error otherwise."""
+        errors = list[Exception]()
+        for effect in map(self._covered, effects):
+            if effect is None:
+                continue
+            try:
+                self._execute(effect)
+            except Exception as error:
+                if isinstance(effect, _SESSION_EFFECTS):
+                    self._restart_mapping(f"it lacks a change ({describe_exception(error)})")
+                    return
+                errors.append(error)
+            try:
+                self._observer.add_effect(effect)
+            except Exception as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]
+
+    def _covered(self, effect: EdgeEffect) -> EdgeEffect | None:
+        """Return an effect without what a study hides; None if it is hidden."""
+        if not isinstance(effect, WriteEvent):
+            return effect
+        fields = self._blinding.covered_event(effect.fields)
+        return None if fields is None else WriteEvent(fields)
 
     def _execute(self, effect: EdgeEffect) -> None:
-        if isinstance(effect, WriteEvent):
-            fields = self._blinding.covered_event(effect.fields)
-            if fields is None:
-                return
-            effect = WriteEvent(fields)
-        self._observer.add_effect(effect)
         match effect:
             case SendToPeer():
                 self._host.send(effect.peer_id, effect.frames)

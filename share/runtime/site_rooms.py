@@ -49,6 +49,7 @@ from share.wire.messages import Refused
 _NO_ROOM = "no room of this site lets this name in: add it to `agents` of one in the rooms file"
 _MAPS_S = 5.0  # period in which the building's graph forgets maps that are gone
 _MAX_VISITED = 2  # rooms at once, each a mapper that restores its map
+_VISIT_S = 120.0  # after which a visit, such as of a room that is never idle, takes no place any more
 _TIMEOUT_S = 5.0  # for the directory's thread at the end
 
 
@@ -87,6 +88,7 @@ class SiteRooms:
         self._growing: set[str] = set()
         self._spare = SpareMapper()
         self._unvisited: deque[str] = deque()  # rooms whose places the directory does not have yet
+        self._visits_s: dict[str, float] = {}  # when each room that is visited was woken up, monotonic
         self._maps_due_s = 0.0  # monotonic
         self._refusals = Throttle(1.0, 5.0)
         self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
@@ -167,8 +169,13 @@ class SiteRooms:
 
     def _visit_rooms(self) -> None:
         """Wake up the rooms one after the other once, so that the directory gets to know their places."""
-        while self._unvisited and sum(room.is_visited for room in self._rooms.values()) < _MAX_VISITED:
+        now_s = time.monotonic()
+        visited = [name for name, room in self._rooms.items() if room.is_visited]
+        self._visits_s = {name: self._visits_s.get(name, now_s) for name in visited}
+        busy = sum(now_s - since_s < _VISIT_S for since_s in self._visits_s.values())
+        while self._unvisited and busy < _MAX_VISITED:
             self._rooms[self._unvisited.popleft()].visit()
+            busy += 1
 
     def _continue_searches(self) -> None:
         while not self._rankings.empty():

@@ -56,9 +56,9 @@ class TrackerProcesses:
         match effect:
             case StartTracker():
                 self._stop(effect.key)
-                self._running[effect.key] = self._start(effect)
-            case TrackFrame():
-                self._running[effect.key].send(effect.frame)
+                self._start(effect)
+            case TrackFrame() if (process := self._running.get(effect.key)) is not None:
+                process.send(effect.frame)
             case StopTracker():
                 self._stop(effect.key)
 
@@ -69,7 +69,7 @@ class TrackerProcesses:
         for thread in self._closing_threads:
             thread.join(_TIMEOUT_S)
 
-    def _start(self, effect: StartTracker) -> WorkerProcess:
+    def _start(self, effect: StartTracker) -> None:
         key, generation = effect.key, effect.generation
         backoff = self._backoffs.setdefault(key, Backoff(time.monotonic_ns()))
 
@@ -78,9 +78,12 @@ class TrackerProcesses:
             self._on_answer(TrackerLost(key, generation, f"{how}; restarted in {pause_s:g} s"))
 
         arguments = (self._settings, effect.rig, key, generation)
-        return WorkerProcess(
-            f"tracking {key}", run_tracker, arguments, self._on_answer, lost, self._pause_s(key)
-        )
+        try:
+            self._running[key] = WorkerProcess(
+                f"tracking {key}", run_tracker, arguments, self._on_answer, lost, self._pause_s(key)
+            )
+        except (OSError, RuntimeError) as error:  # too many open files, or threads
+            lost(f"could not be started: {error}")
 
     def _pause_s(self, key: str) -> float:
         """Return the delay before a start: after a death, or while too many processes are still ending, so
@@ -92,8 +95,13 @@ class TrackerProcesses:
     def _stop(self, key: str) -> None:
         if (process := self._running.pop(key, None)) is not None:
             self._closing_threads = [thread for thread in self._closing_threads if thread.is_alive()]
-            self._closing_threads.append(threading.Thread(target=process.close, daemon=True))
-            self._closing_threads[-1].start()
+            thread = threading.Thread(target=process.close, daemon=True)
+            try:
+                thread.start()
+            except RuntimeError:  # too many threads
+                process.close()
+            else:
+                self._closing_threads.append(thread)
 
 
 def run_tracker(

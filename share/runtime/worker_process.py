@@ -24,7 +24,8 @@ class WorkerProcess:
 
     `send` never waits. `on_answer` is called with each answer, from a thread; `on_death` once, from the same
     thread, if the process ends without being asked to. start_delay_s: delay of the start; messages sent
-    meanwhile are kept. None: it is never started.
+    meanwhile are kept. None: it is never started. Raises OSError and RuntimeError where files or threads are
+    short.
     """
 
     def __init__(
@@ -51,19 +52,29 @@ class WorkerProcess:
         if start_delay_s is not None and start_delay_s <= 0.0:
             self._start()
         sender = threading.Thread(target=self._send_loop, args=(start_delay_s,), daemon=True)
-        self._threads = [sender, threading.Thread(target=self._receive_loop, daemon=True)]
-        for thread in self._threads:
-            thread.start()
+        receiver = threading.Thread(target=self._receive_loop, daemon=True)
+        self._threads = list[threading.Thread]()
+        for thread in (receiver, sender):
+            try:
+                thread.start()
+            except RuntimeError:  # too many threads
+                self._abandon()
+                raise
+            self._threads.append(thread)
+
+    def _abandon(self) -> None:
+        """End the process at once, which nobody can talk to."""
+        self._closing.set()
+        if self._process.pid is not None:
+            self._process.kill()
+            self._process.join()
+        self._child_end.close()
+        self._parent_end.close()
 
     @property
     def pid(self) -> int | None:
         """None before the start."""
         return self._process.pid
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether the process could be started at all."""
-        return self.pid is not None
 
     def _start(self) -> None:
         """Start the process, unless it was closed before."""

@@ -287,3 +287,15 @@ def test_a_predicted_pose_counts_as_late_as_it_is(walk: rig_fuzzer.Walk) -> None
     assert (frames[0].state, frames[0].T_odom_body) == (TrackState.INITIALISING, None)
     assert frames[-1].state is TrackState.OK and frames[-1].T_odom_body is not None
     assert all(one.track_ms >= 150 and not one.is_keyframe for one in (frames[0], frames[-1]))
+
+
+def test_a_guard_that_cannot_tell_what_failed_goes_on():
+    def tell(text):
+        raise RuntimeError("can't start new thread")
+
+    guard = FaultGuard(tell)
+    for _ in range(2):
+        with guard.step("a message"):
+            raise KeyError("lost")
+    assert guard.failure_count == 2
+    assert "KeyError" in guard.trouble

@@ -21,15 +21,22 @@ from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveKeyframes, RemoveRun, StoredMap
 from share.net.transport import IncomingMessage
 from share.protocol.edge import EdgeProtocol
-from share.protocol.edge_events import ChangesSaved, MapperResult, PeerMessageReceived, TrackerLost
+from share.protocol.edge_events import (
+    ChangesSaved,
+    MapperResult,
+    PeerMessageReceived,
+    SaveChanges,
+    SendToPeer,
+    TrackerLost,
+)
 from share.runtime import edge as edge_module
-from share.runtime import mapper_process, served_room
+from share.runtime import mapper_process, mapper_supervision, served_room
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge import EdgeRun
 from share.runtime.edge_observer import EdgeObservers
 from share.runtime.map_writer import MapWriter
-from share.runtime.mapper_process import MapperReport, MapRestored, RestoreMap
-from share.runtime.mapper_supervision import MapperRestarts
+from share.runtime.mapper_process import MapperReport, MapRestored, RestoreBegun, RestoreMap
+from share.runtime.mapper_supervision import MapperProgress, MapperRestarts
 from share.runtime.served_room import ServedRoom
 from share.runtime.worker_process import END
 from share.store import map_store
@@ -61,6 +68,7 @@ def dies_of_a_map(inbox, answer):
     """A mapper that cannot take in any keyframe."""
     while (message := inbox.get()) is not END:
         if isinstance(message, RestoreMap):
+            answer(RestoreBegun())
             if message.stored_map.keyframes:
                 os._exit(3)
             answer(MapRestored())
@@ -89,9 +97,9 @@ def edge(path, monkeypatch):
 
     def make(mapper):
         monkeypatch.setattr(mapper_process, "run_mapper", mapper)
-        died = MapperRestarts.record_death
+        failed = MapperRestarts.record_failure
         monkeypatch.setattr(
-            MapperRestarts, "record_death", lambda self, *a: pauses.append(died(self, *a)) or pauses[-1] / 100
+            MapperRestarts, "record_failure", lambda self: pauses.append(failed(self)) or pauses[-1] / 100
         )
         pauses, events = [], []
         run = EdgeRun(Config(), Link(), None, events.append, MapStore.open(path))
@@ -389,10 +397,7 @@ def serve(path, start_mapper):
 
 
 class Process:
-    """A mapper's process. pid: None if it could not be started."""
-
-    def __init__(self, pid):
-        self.has_begun = pid is not None
+    """A mapper's process."""
 
     def send(self, message): ...
     def close(self): ...
@@ -401,8 +406,8 @@ class Process:
 @pytest.fixture
 def quick(monkeypatch):
     """Pauses are a hundredth as long."""
-    died = MapperRestarts.record_death
-    monkeypatch.setattr(MapperRestarts, "record_death", lambda self, *args: died(self, *args) / 100)
+    failed = MapperRestarts.record_failure
+    monkeypatch.setattr(MapperRestarts, "record_failure", lambda self: failed(self) / 100)
 
 
 def test_a_mapper_that_cannot_be_started_is_tried_again(path, quick):
@@ -413,7 +418,7 @@ def test_a_mapper_that_cannot_be_started_is_tried_again(path, quick):
         deaths.append(on_death)
         if (error := errors.pop(0)) is not None:
             raise error
-        return Process(4711)
+        return Process()
 
     deaths: list = []
     room = serve(path, start)
@@ -428,7 +433,7 @@ def test_a_mapper_that_cannot_be_started_is_tried_again(path, quick):
 def test_a_room_whose_map_is_loading_is_not_idle(path):
     """It would fall asleep, and be shown as loading for as long."""
     answers: list = []
-    room = serve(path, lambda on_answer, on_death, delay_s: answers.append(on_answer) or Process(4711))
+    room = serve(path, lambda on_answer, on_death, delay_s: answers.append(on_answer) or Process())
     answers[0](MapperReport({}, is_idle=True))  # while the map is on its way to the mapper
     room.step()
     assert not room.is_idle
@@ -438,16 +443,81 @@ def test_a_room_whose_map_is_loading_is_not_idle(path):
     room.close()
 
 
-@pytest.mark.parametrize("pid", [None, 4711])
-def test_a_map_is_not_to_blame_where_no_process_can_be_started(path, quick, pid):
-    """It was set aside when the machine had no memory or processes three times."""
-    deaths: list = []
-    room = serve(path, lambda on_answer, on_death, delay_s: deaths.append(on_death) or Process(pid))
+@pytest.mark.parametrize("has_begun", [False, True])
+def test_a_map_is_not_to_blame_where_a_mapper_dies_before_it_restores_it(path, quick, has_begun):
+    """It was set aside when the machine had no memory, processes or threads three times."""
+    started: list = []
+    room = serve(
+        path, lambda on_answer, on_death, delay_s: started.append((on_answer, on_death)) or Process()
+    )
     for _ in range(6):
-        deaths[-1]("could not be started: Resource temporarily unavailable")
+        on_answer, on_death = started[-1]
+        if has_begun:
+            on_answer(RestoreBegun())
+        on_death("ended with exit code 1")
         room.step()
     room.close()
-    assert path.with_name("room.sqlite.damaged-1").exists() is (pid is not None)
+    assert path.with_name("room.sqlite.damaged-1").exists() is has_begun
+
+
+def test_a_restart_that_fails_is_tried_again_after_a_pause(path, quick, monkeypatch):
+    """An error that nobody expected was tried again in each step, with a line each."""
+    started, tries = [], []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append((on_death, delay_s)) or Process())
+    load = MapperRestarts.load_map
+
+    def failing(self):
+        tries.append(time.monotonic())
+        if len(tries) < 4:
+            raise MemoryError
+        return load(self)
+
+    monkeypatch.setattr(MapperRestarts, "load_map", failing)
+    started[0][0]("was ended by SIGKILL")
+    until(lambda: room.step() or not (room.is_waiting or len(started) < 2))
+    assert np.all(np.diff(tries) >= [0.01, 0.02, 0.04])
+    assert [delay_s for _, delay_s in started] == [0.0, 0.0]  # it has waited
+    assert room.close() is None
+
+
+def test_a_session_goes_on_without_what_nobody_needs_only(path, quick):
+    """An error in one effect of a message lost all later ones, among them what mapper and file build on."""
+    room = serve(path, lambda *_: Process())
+    sent: list = []
+    room._host.send = lambda peer, frames: sent.append(frames) if frames else {}["none"]
+    save = SaveChanges(1, (RemoveKeyframes((KeyframeKey("ann-0003", 7),)),))
+    before = room.report()["session"]
+    with pytest.raises(KeyError):
+        room.execute([SendToPeer(b"ann", ()), SendToPeer(b"bob", (b"1",)), save])
+    assert sent == [(b"1",)]
+    assert room.report()["session"] == before
+    room._map_writer.submit = lambda request: {}["none"]
+    room.execute([save, SendToPeer(b"ann", (b"2",))])
+    assert sent == [(b"1",)]  # such as an acknowledgement of what is not in the file
+    assert room.report()["session"] != before
+    assert "it lacks a change (KeyError: 'none'" in room.report()["trouble"][0]
+    room.close()
+
+
+def test_an_observer_that_fails_costs_nothing(path):
+    room = serve(path, lambda *_: Process())
+    sent: list = []
+    room._host.send = lambda peer, frames: sent.append(frames)
+    room._observer.add_effect = lambda effect: {}["none"]
+    with pytest.raises(KeyError):
+        room.execute([SendToPeer(b"ann", (b"1",)), SendToPeer(b"ann", (b"2",))])
+    assert sent == [(b"1",), (b"2",)]
+    room.close()
+
+
+def test_a_mapper_that_never_reports_is_trouble(monkeypatch):
+    progress = MapperProgress(start_delay_s=5.0)
+    assert progress.stall() is None
+    now_s = time.monotonic()
+    monkeypatch.setattr(mapper_supervision.time, "monotonic", lambda: now_s + 64.0)
+    assert progress.stall() is None
+    monkeypatch.setattr(mapper_supervision.time, "monotonic", lambda: now_s + 70.0)
+    assert "the mapper has not reported for 65 s since it was to start" in (progress.stall() or "")
 
 
 def counts(inbox, answer):
@@ -497,9 +567,9 @@ def test_a_failed_report_is_shown_as_stale(edge, monkeypatch):
     monkeypatch.setattr(edge_module, "_STALE_REPORT_S", 0.2)
     with monkeypatch.context() as patch:
         patch.setattr(EdgeProtocol, "report", lambda self, mapper: {}["none"])
-        until(lambda: any("stuck" in line for line in run.report()["trouble"]))
+        until(lambda: any("no report can be made (KeyError" in line for line in run.report()["trouble"]))
         assert [line["event"] for line in events].count("internal error") == 1
-    until(lambda: not any("stuck" in line for line in run.report()["trouble"]))
+    until(lambda: not any("no report" in line for line in run.report()["trouble"]))
 
 
 def fails_to_solve(inbox, answer):

@@ -98,3 +98,10 @@ def test_a_failed_job_is_raised_at_the_end() -> None:
     assert disk.lines == [0, 1, 2]
     with pytest.raises(ShareError, match="Disk quota exceeded"):
         writer.check()
+
+
+def test_a_thread_that_cannot_be_had_is_missed_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not at the first job, of which another would wait in vain."""
+    monkeypatch.setattr(threading.Thread, "start", lambda thread: {}["none"])
+    with pytest.raises(KeyError):
+        OutputWriter("out", print)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import queue
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
+
+import pytest
 
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 
@@ -125,3 +129,27 @@ def _alive(pid: int) -> bool:
             return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
     except FileNotFoundError:
         return False
+
+
+@pytest.mark.parametrize("later", [0, 1])
+def test_a_process_without_a_thread_to_talk_to_it_is_ended(
+    monkeypatch: pytest.MonkeyPatch, later: int
+) -> None:
+    """It went on, and nobody knew it."""
+    started = list[Any]()
+    start = threading.Thread.start
+
+    def limited(thread: threading.Thread) -> None:
+        if len(started) >= later:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", limited)
+        with pytest.raises(RuntimeError, match="can't start new thread"):
+            WorkerProcess("lone", doubles, (), print, print)
+    assert not any(process.name == "lone" for process in multiprocessing.active_children())
+    for thread in started:
+        thread.join(10)
+        assert not thread.is_alive()
