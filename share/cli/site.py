@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     "views",
     metavar="ROOM=[H:]P",
     multiple=True,
-    help="Show this room live in 3D here (needs viser); repeatable.",
+    help="Show this room live in 3D here (needs viser). May be repeated.",
 )
 @edge_options.http_token
 @edge_options.allow

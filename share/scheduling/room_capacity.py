@@ -57,11 +57,10 @@ class RoomCapacity:
         """Return why the room cannot serve one more agent of a form, for a person; None if it can."""
         if not _is_settled(self.full_since_ns.get(form), now_ns):
             return None
-        kind = "headset" if form is AgentKind.AR else "robot"
         ms = self.air_ms[form]
         how_long = f"{ms:.0f} ms" if ms < _MAX_TOLD_MS else "seconds"
         return (
-            f"no air for one more {kind}: a keyframe would take {how_long}, {TOLERATED_AIR_MS:.0f} ms at most"
+            f"no air for one more agent: a keyframe would take {how_long}, {TOLERATED_AIR_MS:.0f} ms at most"
         )
 
     def displaced(self, form: AgentKind, now_ns: int) -> tuple[str, ...]:

@@ -321,7 +321,7 @@ def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none()
 
     crowded = EdgeProtocol(Config(), 7)
     now_s = evaluated(crowded, 15 * headset + 5 * bot)
-    assert "no air for one more robot" in refusal(tell(crowded, 100, robot("late", 100), now_s))
+    assert "no air for one more agent" in refusal(tell(crowded, 100, robot("late", 100), now_s))
     assert "no air left beside headsets" in refusal(come(crowded, "eve", 101, now_s))
     agents = crowded.report({})["agents"]
     assert not agents["eve"]["gone"]
@@ -330,7 +330,7 @@ def test_by_what_agents_report_a_headset_finds_room_in_place_of_robots_or_none()
 
     full = EdgeProtocol(Config(), 7)
     now_s = evaluated(full, 20 * headset)
-    assert "no air for one more headset" in refusal(come(full, "eve", 101, now_s))
+    assert "no air for one more agent" in refusal(come(full, "eve", 101, now_s))
     assert refusal(come(full, "eve", 101, now_s + 60)) is None  # all others have fallen silent
 
 

@@ -39,7 +39,7 @@ def test_the_report_has_no_rates_under_any_policy() -> None:
         "reason": "made room for 'ann'",
         "merges": {"requested": 3, "skipped": 2, "done": 1},
     }
-    full = "no air for one more robot: a keyframe would take 214 ms, 140 ms at most"
+    full = "no air for one more agent: a keyframe would take 214 ms, 140 ms at most"
     report = {"agents": {"bot": agent}, "refused": [full, f"bot, 3 times: {full}", "other"]}
     covered = BLINDING.covered({**report, "merges": agent["merges"], "policy": "share", "config": {}})
     merges = {"requested": None, "skipped": None, "done": 1}

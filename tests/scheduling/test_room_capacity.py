@@ -49,7 +49,7 @@ def test_robots_leave_first_the_newest_before_others() -> None:
     assert crowded_air_ms(budget, AR) > TOLERATED_AIR_MS
     capacity = settled(budget)
     assert capacity.objection(AR, 10 * S) is None
-    assert "one more robot" in str(capacity.objection(ROBOT, 10 * S))
+    assert "one more agent" in str(capacity.objection(ROBOT, 10 * S))
     assert capacity.displaced(AR, 10 * S)[0] == "robot43"
     assert set(capacity.displaced(AR, 10 * S)) < {f"robot{k}" for k in range(37, 44)}
     assert crowded_air_ms(budget, AR, capacity.displaced(AR, 10 * S)) <= TOLERATED_AIR_MS
@@ -59,7 +59,7 @@ def test_robots_leave_first_the_newest_before_others() -> None:
 def test_a_room_full_of_headsets_says_so() -> None:
     capacity = settled(room(42, 0))
     said = str(capacity.objection(AR, 10 * S))
-    assert said.startswith("no air for one more headset: a keyframe would take ")
+    assert said.startswith("no air for one more agent: a keyframe would take ")
     assert said.endswith(f"{TOLERATED_AIR_MS:.0f} ms at most")
     assert "seconds" in str(settled(room(60, 0)).objection(AR, 10 * S))
 

@@ -1,4 +1,4 @@
-"""How long each step of processing takes in a simulated room: drawn from measured distributions."""
+"""How long each step of processing takes in a simulated room: drawn from quantiles of what was measured."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ MS_NS = 1_000_000
 
 @dataclass(frozen=True)
 class Delay:
-    """Lognormal delay, ms: half of all draws are below `p50`, 95 % below `p95`."""
+    """Lognormal delay, ms, through two measured quantiles: half of all draws are below `p50`, 95 % below
+    `p95`. It has no tail to speak of, so nothing follows from it about rare long delays."""
 
     p50: float
     p95: float
