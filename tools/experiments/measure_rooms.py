@@ -27,6 +27,7 @@ from keyframe_set import AgentKeyframes, Spacing, keyframe_set  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
+from share.earlier_poses import EarlierPoses  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.lab.emulate.recipe import SessionRecipe  # noqa: E402
@@ -152,7 +153,9 @@ def _carry(
     found: tuple[int, str] | None = None
     for count, keyframe in enumerate(second.keyframes[start : start + MOST], 1):
         if count == 1:
-            keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=())
+            keyframe = replace(
+                keyframe, reference=-1, T_ref_body=keyframe.T_odom_body, earlier=EarlierPoses.empty()
+            )
         lost.add(run, keyframe)
         for news in lost.mapper.take_place_news():
             ranking = directory.update("lost", news)
