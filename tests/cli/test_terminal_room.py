@@ -12,6 +12,7 @@ import click
 import pytest
 from helpers.terminal_room import PLAN, REPORT, Terminal
 
+from share.cli.stderr import flush_all
 from share.cli.terminal import LiveLine
 from share.cli.terminal_room import TerminalRoom, draw_room, has_room
 from share.cli.watch import _last_line
@@ -52,6 +53,7 @@ def test_what_the_edge_says_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_line_of_the_edge_brings_escapes(monkeypatch: pytest.MonkeyPatch, report: dict[str, Any]) -> None:
     screen = watched(monkeypatch)
     draw_room(LiveLine(), TerminalPicture(), REPORT, PLAN, _last_line("http://h:1/", report, 0.0))
+    flush_all()
     drawn = screen.getvalue()
     assert "?]0;owned?" in drawn and "\x1b]" not in drawn and "\x07" not in drawn
 

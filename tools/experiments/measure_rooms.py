@@ -111,9 +111,9 @@ def measure(options: argparse.Namespace) -> None:
         first, second = keyframe_set(recipe, SPACING, workers=options.workers).agents.values()
         name = f"{seed}-{day}"
         rooms[name], walks[name] = Room(name), (first, second)
-        rooms[name].add_run("first", first)
+        rooms[name].add_run(f"{name}-first", first)
         for keyframe in first.keyframes:
-            rooms[name].add("first", keyframe)
+            rooms[name].add(f"{name}-first", keyframe)
         for news in rooms[name].mapper.take_place_news():
             directory.update(name, news)
         print(f"{name}: {len(first.keyframes)} and {len(second.keyframes)} keyframes", flush=True)
@@ -148,7 +148,7 @@ def _carry(
     first, second = walks
     (metres,), (angles,) = se3.pairwise_distances(second.T_world_body[start][None], first.T_world_body)
     in_view = bool(((metres < IN_VIEW_M) & (angles < IN_VIEW_RAD)).any())
-    lost, finder, run = Room("lost"), RoomFinder(), "second"
+    lost, finder, run = Room("lost"), RoomFinder(), f"{name}-second-{start}"
     lost.add_run(run, second)
     found: tuple[int, str] | None = None
     for count, keyframe in enumerate(second.keyframes[start : start + MOST], 1):
