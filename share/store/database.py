@@ -90,9 +90,12 @@ def translate_errors(path: Path, action: str, writes: bool = False) -> Iterator[
     except DAMAGE_ERRORS as error:
         if is_damage(error):
             raise DamageError(f"{path}: the map is damaged: {error}") from None
-        why = why_not_written(error, path) if writes else size_limit_message(error, path) or str(error)
-        why = why or "out of memory"  # of a MemoryError, which has no text
+        why = why_not_written(error, path) if writes else size_limit_message(error, path) or _text(error)
         raise StoreError(f"{path}: the map cannot be {action}: {why}") from None
+
+
+def _text(error: Exception) -> str:
+    return str(error) or "out of memory"  # a MemoryError has none
 
 
 def is_damage(error: Exception) -> bool:
@@ -198,7 +201,7 @@ def why_not_written(error: Exception, path: Path) -> str:
             os.fsync(file.fileno())
     except OSError as system:
         return system.strerror or str(system)
-    return str(error)
+    return _text(error)
 
 
 def size_limit_message(error: Exception, path: Path) -> str | None:

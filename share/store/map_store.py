@@ -121,7 +121,7 @@ class MapStore:
         except BaseException as error:
             with contextlib.suppress(sqlite3.Error):  # on a full disk SQLite has rolled back by itself
                 db.execute("ROLLBACK")
-            if isinstance(error, sqlite3.Error):
+            if isinstance(error, sqlite3.Error | MemoryError):
                 raise self._write_error(error) from None
             raise
         self._is_wiping |= any(isinstance(change, Wipe) for change in new_changes)
@@ -155,7 +155,7 @@ class MapStore:
             raise self._write_error(error) from None
         return not is_busy
 
-    def _write_error(self, error: sqlite3.Error) -> StoreError:
+    def _write_error(self, error: sqlite3.Error | MemoryError) -> StoreError:
         kind = DamageError if database.is_damage(error) else StoreError
         return kind(f"{self.path}: the map cannot be written: {why_not_written(error, self.path)}")
 

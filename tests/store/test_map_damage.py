@@ -358,6 +358,19 @@ def test_a_machine_that_fails_for_a_moment_costs_no_rows(tmp_path, error, number
     assert not path.with_name("room.sqlite.damaged-1").exists()
 
 
+def test_a_change_for_which_memory_is_short_is_not_taken_for_faulty(tmp_path):
+    """It was skipped, and its keyframe acknowledged."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        connection = store._db
+        store._db = FailingConnection(connection, MemoryError(), 2)
+        with pytest.raises(StoreError, match="the map cannot be written: out of memory"):
+            store.write(small_map())
+        store._db = connection
+        store.write(small_map())
+        assert len(store.load().keyframes) == 40
+
+
 def test_short_memory_while_a_file_is_opened_does_not_make_it_damaged(whole, tmp_path, monkeypatch):
     path = tmp_path / "room.sqlite"
     path.write_bytes(whole[0])
