@@ -241,11 +241,11 @@ class SiteRooms:
 
     def _update_report(self, name: str, room: RoomKeeper) -> None:
         """Make a room's report. A failure costs this one: the last one is shown, and says so."""
+        report = {**self._reports.get(name, {}), "trouble": [_STALE_REPORT]}
         with self._guard.step(f"a report of room '{name}'"):  # the others are shown as they are
-            self._reports[name] = room.report()
-            return
-        if name in self._reports:
-            self._reports[name] = {**self._reports[name], "trouble": [_STALE_REPORT]}
+            report = room.report()
+        if name in self._reports or "session" in report:  # else there never was one
+            self._reports[name] = report
 
     # ------------------------------------------------------------------ what rooms tell
 
