@@ -14,7 +14,7 @@ from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.peer import Peer, RestoredRun, Sender
 from share.scheduling.rate_scheduler import RateScheduler
 from share.timing import TokenBucket, TokenBuckets, seconds_to_ns
-from share.wire.messages import Hello, PoseUpdate, peer_tag, public_tag
+from share.wire.messages import Hello, PoseUpdate, peer_id, peer_tag, public_tag
 
 # Limits on new runs, each at once and a second: each run stays in the map once it has a keyframe. One name:
 # as many as a person starts while trying things out; one key: a full room; the edge: two.
@@ -66,7 +66,9 @@ class Admission:
     ) -> str | None:
         """Return why this run may not join, for a person; None if it may. event: carried `hello`."""
         if not event.is_authorised_for(hello.name):
-            return name_objection(hello.name, event.allowed_names or ())
+            return name_objection(hello.name, event)
+        if peer_id(hello.run_id) != event.peer_id:  # the run would come back as another
+            return "its hello says another run id than its connection; start the agent again"
         if hello.streams_frames and not self._tracks_agents:
             remedy = "start it with --policy streamed, or the agent without --streamed"
             return f"this edge does not track agents: {remedy}"
@@ -109,13 +111,22 @@ def new_run_key(hello: Hello, used_keys: Collection[str]) -> str:
     return key
 
 
-def name_objection(name: str, allowed_names: Collection[str]) -> str:
-    """Return why a peer authorised for `allowed_names` is refused as `name`, with the remedy."""
-    allowed = ", ".join(f"'{one}'" for one in sorted(allowed_names)) or "no agent"
+def name_objection(name: str, event: PeerMessageReceived) -> str:
+    """Return why the sender is refused as `name`, for which it is not authorised, with the remedy."""
+    allowed = ", ".join(f"'{one}'" for one in sorted(event.allowed_names or ())) or "no agent"
+    if not event.credential:  # without keys only a site's room has names
+        return f"this room is for {allowed}, not for '{name}': see `agents` of the room in the rooms file"
     return (
         f"its key is authorized for {allowed}, not for '{name}'; on the edge run: "
         f"share keys authorize … --agent {name}"
     )
+
+
+def misuse_text(event: PeerMessageReceived, name: str) -> str:
+    """Return what a sender did that sent as a run of `name`, for which it is not authorised."""
+    if not event.credential:
+        return f"the run of '{name}' was used in a room where it may not be"
+    return f"a key that is not authorized for '{name}' used its run"
 
 
 # Registry of the runs that an edge knows, ended ones included.
@@ -136,7 +147,8 @@ class ForgottenRun:
 
 class RunRegistry(Mapping[bytes, Peer]):
     """Runs by their peer id on the link. Each run has a key that names it everywhere else; the run of a name
-    that joined or came back last is the latest. unjoined: what is counted of all other peers together.
+    that joined or came back last is the latest. Of several runs in a map file with one id the first has it,
+    and the others are known by their keys only. unjoined: what is counted of all other peers together.
     forgotten: next keyframes of runs that earlier sessions have forgotten, by `public_tag`."""
 
     def __init__(self, forgotten: Mapping[str, int]) -> None:
@@ -218,7 +230,8 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     def add(self, peer: Peer) -> None:
         """Add a run that takes part."""
-        self._peers[peer.id] = self.by_key[peer.key] = peer
+        self._peers.setdefault(peer.id, peer)
+        self.by_key[peer.key] = peer
         self._runs.add(peer.key, peer.name)
         self.mark_present(peer)
 
@@ -260,16 +273,18 @@ class RunRegistry(Mapping[bytes, Peer]):
 
     def forget(self, peer: Peer) -> bool:
         """Remove a run for good. Return whether it was the latest of its name."""
-        was_latest = self.is_latest(peer)
+        was_latest, had_id = self.is_latest(peer), self._peers.get(peer.id) is peer
         self._remove(peer)
         self._empty_runs.pop(peer.key, None)
         self.forgotten_count += peer.odometry_base is not None
-        if (next_keyframe := peer.reorder_buffer.next_keyframe) > 0:
+        if had_id and (next_keyframe := peer.reorder_buffer.next_keyframe) > 0:
             self._remember(peer_tag(peer.id), ForgottenRun(next_keyframe, peer.session, peer.revision))
         return was_latest
 
     def _remove(self, peer: Peer) -> None:
-        del self.by_key[peer.key], self._peers[peer.id]
+        del self.by_key[peer.key]
+        if self._peers.get(peer.id) is peer:
+            del self._peers[peer.id]
         self._runs.remove(peer.key)
         self._idle.pop(peer.key, None)
         self._missed.pop(peer.key, None)

@@ -133,7 +133,7 @@ class ClientRegistry:
         """Return the client of a hello; the reason if it is refused; None while it is not answered."""
         now_ns = self._out.now_ns
         if not event.is_authorised_for(hello.name):
-            return name_objection(hello.name, event.allowed_names or ())
+            return name_objection(hello.name, event)
         if (known := self._clients.get(event.peer_id)) is not None:
             return known if known.hello == hello else "this run id is in use by another client; start again"
         if hello.drives_robot and (bridge := self.bridge(hello.name)) is not None:

@@ -17,7 +17,7 @@ from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import SaveKeyframe, SaveObject, SavePoses, SaveRun
 from share.plain_data import to_mapping
 from share.protocol import edge_events as ed
-from share.protocol.admission import RunRegistry
+from share.protocol.admission import RunRegistry, misuse_text
 from share.protocol.client_registry import Client
 from share.protocol.client_service import CLIENT_MESSAGES, ClientService
 from share.protocol.common_events import Tick
@@ -153,9 +153,7 @@ class EdgeProtocol:
         if peer is not None and not self._membership.may_send(event, peer, message):
             return
         if client is not None and not self.room.may_send(event, client):
-            self._out.count_bad_message(
-                None, f"a key that is not authorized for '{client.name}' used its run"
-            )
+            self._out.count_bad_message(None, misuse_text(event, client.name))
             return
         match message:
             case ClientHello():
@@ -382,7 +380,7 @@ class EdgeProtocol:
                 self._registry.label(peer): self._peer_report(peer) | mapped.get(peer.key, {})
                 for peer in peers
             },
-            "unlisted_runs": len(self._registry) - len(peers),
+            "unlisted_runs": len(self._registry.by_key) - len(peers),
             "unjoined": dict(self._registry.unjoined.counts),
             "refused": [
                 *filter(None, [self._rate_scheduler.full_reason(self._out.now_ns)]),

@@ -10,7 +10,14 @@ from share.geometry.camera import Rig
 from share.mapping.corrections import MapEvent
 from share.mapping.map_changes import RemoveRun, SaveCredential
 from share.protocol import edge_events as ed
-from share.protocol.admission import Admission, ForgottenRun, RunRegistry, name_objection, new_run_key
+from share.protocol.admission import (
+    Admission,
+    ForgottenRun,
+    RunRegistry,
+    misuse_text,
+    name_objection,
+    new_run_key,
+)
 from share.protocol.client_service import ClientService
 from share.protocol.edge_records import EdgeOutput
 from share.protocol.keyframe_intake import ReorderBuffer
@@ -185,14 +192,15 @@ class RoomMembership:
 
     def entry_objection(self, peer: Peer) -> str | None:
         """Return why a run may not come from another room; None if it may."""
-        known = self._registry.by_key.get(peer.key)
-        if known is not None and known.id != peer.id:
-            return f"another run is called {peer.key} there"
+        named, known = self._registry.by_key.get(peer.key), self._registry.get(peer.id)
+        if named is not known:
+            return f"another run is called {peer.key} there" if named else "it has another name there"
         return self._admission.capacity_objection(peer.hello, self._registry, self._out.now_ns)
 
     def take_over(self, peer: Peer, room: str) -> None:
         """Take in a run from another room; nothing objects."""
         peer.entry = RoomEntry(self._out.now_ns + seconds_to_ns(_ENTRY_S))
+        self._supersede(peer.name)
         was_here = self._registry.take_over(peer)
         change = (
             ed.SetPresence(peer.key, True)
@@ -251,9 +259,9 @@ class RoomMembership:
     def may_send(self, event: ed.PeerMessageReceived, peer: Peer, message: wire.Message) -> bool:
         """Return whether a known run may send: its credential allows it, and it is present or comes back."""
         if not event.is_authorised_for(peer.name):
-            self._out.count_bad_message(None, f"a key that is not authorized for '{peer.name}' used its run")
+            self._out.count_bad_message(None, misuse_text(event, peer.name))
             if isinstance(message, wire.Hello):  # only a hello is answered
-                reason = name_objection(peer.name, event.allowed_names or ())
+                reason = name_objection(peer.name, event)
                 self._out.send(event.peer_id, wire.Refused(reason))
                 self._out.record("refused", None, reason)
             return False

@@ -249,11 +249,16 @@ class Peer(Sender):
 
 def fault_warnings(peers: Iterable[Peer], unjoined: Sender, now_ns: int) -> list[str]:
     """Return a warning line for each sender with repeatedly refused messages or suspect keyframes."""
-    kinds = [("peers that have not joined", "messages refused", unjoined.refusals)]
+    kinds = list[tuple[str, str, Faults]]()
     for peer in peers:
         kinds.append((f"agent '{peer.name}'", "messages refused", peer.refusals))
         kinds.append((f"agent '{peer.name}'", "suspect keyframes", peer.suspect_keyframes))
-    return fault_lines(kinds, now_ns)
+    return [*stranger_lines(unjoined, now_ns), *fault_lines(kinds, now_ns)]
+
+
+def stranger_lines(unjoined: Sender, now_ns: int) -> list[str]:
+    """Return a warning line if messages of peers that have not joined are many and recent."""
+    return fault_lines([("peers that have not joined", "messages refused", unjoined.refusals)], now_ns)
 
 
 def fault_lines(kinds: Iterable[tuple[str, str, Faults]], now_ns: int) -> list[str]:

@@ -15,6 +15,7 @@ from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.mapper_process import MapperReport, RestoreMap
 from share.runtime.room_parts import RoomStore
 from share.store.forgetting import damaged_copies
+from share.store.salvage import ReadRows
 from share.timing import Backoff
 
 TROUBLE_SHOWN_S = 10.0  # how long the death of a process is shown as trouble
@@ -106,7 +107,7 @@ class MapperRestarts:
         if self.store is None:
             return None, []
         try:
-            restore, outline = RestoreMap(self.store.rows(), self._has_keys), self.store.outline()
+            restore, outline = RestoreMap(self._rows(self.store), self._has_keys), self.store.outline()
             outline = with_unknown_credentials(outline) if self._has_keys else outline
             self.forgotten = outline.forgotten if self.forgotten is None else self.forgotten
             known = restored_runs(outline, self._known_m)
@@ -121,6 +122,15 @@ class MapperRestarts:
         self._restored_keyframes = len(restore.rows.tables["keyframe"])
         self._is_restoring = self._restored_keyframes > 0
         return restore, known
+
+    def _rows(self, store: RoomStore) -> ReadRows:
+        """Return the rows of the file; say what is missing since it was found damaged now."""
+        known = store.problems
+        try:
+            return store.rows()
+        finally:
+            for problem in store.problems[len(known) :]:
+                self._notify(problem)
 
     def _set_aside(self, reason: str) -> None:
         self._tries = 0

@@ -109,7 +109,8 @@ class RemoteStore:
 
     def _described(self) -> OpenedFile:
         if self._opened is None:
-            self._opened = self._room.call("describe_map", timeout_s=_LOOP_S)
+            self._opened = opened = self._room.call("describe_map", timeout_s=_LOOP_S)
+            self.problems = opened.problems  # it may have been repaired
         return self._opened
 
     def write(self, new_changes: Sequence[MapChange]) -> None:

@@ -12,17 +12,18 @@ from __future__ import annotations
 import math
 import queue
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from share.errors import VersionError, WireError, brief_reason
+from share.errors import VersionError, WireError, brief_reason, describe_exception
 from share.mapping.places import FindKeyframe
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import PeerMessageReceived
 from share.protocol.edge_records import SessionTotals
+from share.protocol.peer import Sender, stranger_lines
 from share.protocol.versions import refusal_of_version
 from share.runtime.mapper_supervision import RecentTroubles
 from share.runtime.output_writer import JobThread
@@ -100,6 +101,8 @@ class RoomKeeper:
         self._backoff = Backoff(time.monotonic_ns())
         self._is_lost = False  # its machine is gone, and it is closed for that
         self._losses, self._loss_backoff = RecentTroubles(), Backoff(time.monotonic_ns())
+        self._strangers = Sender()  # what a sleeping room was sent in vain
+        self._said_problems = set(() if store is None else store.problems)  # of the map file
         self._last_report: dict[str, Any] = {}
         self._last_series: Mapping[str, Mapping[str, Any]] = {}
         self._used_s = self._asleep_s = time.monotonic()  # last used, fallen asleep
@@ -124,16 +127,35 @@ class RoomKeeper:
         return None if self._room is None else self._room.protocol
 
     def handle(self, event: PeerMessageReceived) -> None:
-        """Handle a message; a sleeping room keeps it and wakes up, if it comes from somebody that it knows or
-        says hello. It answers the ping of a stranger."""
+        """Handle a message. A sleeping room wakes up for somebody that it knows and for a hello; it keeps
+        hellos and pings, all else comes again. It answers a stranger's ping, and counts what is neither."""
         if self._room is not None:
             self._room.handle(event)
-        elif self.knows(event.peer_id) is not None or _is_hello(event):
-            self._messages.append((time.monotonic(), event))
-            self._is_called = True
-        elif (ping := _ping_of(event)) is not None:
-            pong = Pong.answering(ping, time.monotonic_ns(), NO_SESSION)
-            self._host.send(event.peer_id, encode(pong))
+            return
+        is_known = self.knows(event.peer_id) is not None
+        self._is_called |= is_known
+        try:
+            message = decode_only(event.frames, Hello, ClientHello, Ping)
+        except VersionError as error:
+            if refusal_of_version(error) is not None:  # it is to hear that, of the header
+                self._keep(replace(event, frames=event.frames[:1]))
+            else:
+                self._strangers.counts["other_version"] += 1
+        except WireError as error:
+            self._strangers.count("bad_messages", str(error), time.monotonic_ns())
+        else:
+            if isinstance(message, Ping) and not is_known:
+                pong = Pong.answering(message, time.monotonic_ns(), NO_SESSION)
+                self._host.send(event.peer_id, encode(pong))
+            elif message is not None:
+                self._keep(event)
+            elif not is_known:
+                kind = message_type(event.frames).__name__
+                self._strangers.count("unexpected", f"a message {kind} before its hello", time.monotonic_ns())
+
+    def _keep(self, event: PeerMessageReceived) -> None:
+        self._messages.append((time.monotonic(), event))
+        self._is_called = True
 
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe in the map, as soon as the room is awake."""
@@ -200,12 +222,12 @@ class RoomKeeper:
 
     def _fall_asleep(self, room: ServedRoom) -> None:
         self._is_visit = False
-        self._last_protocol, self._last_series, self._last_report = (
-            room.protocol,
-            self.series(),
-            room.report(),
-        )
-        self._totals, self._asleep_s = room.end_totals(), time.monotonic()
+        self._last_protocol, self._asleep_s = room.protocol, time.monotonic()
+        try:
+            self._last_series, self._last_report = self.series(), room.report()
+            self._totals = room.end_totals()
+        except Exception as error:  # what is shown does not keep a room awake
+            self._host.log_event("internal error", f"its last report: {describe_exception(error)}")
         self._room, self._closing = None, room
         self._submit(partial(end_processes, room))
 
@@ -261,6 +283,10 @@ class RoomKeeper:
             return
         self._failure, self._is_called, self._used_s = "", False, time.monotonic()
         self._expiry_s = math.inf
+        for problem in opened.store.problems:
+            if problem not in self._said_problems:
+                self._said_problems.add(problem)
+                self._host.log_event("map", problem)
         for request in self._searches:
             self._room.find(request)
         for received_s, event in self._messages:
@@ -294,18 +320,27 @@ class RoomKeeper:
         return {**series, **self._last_series, **new}
 
     def report(self) -> dict[str, Any]:
-        """Return edge.json of the room; of a sleeping one as it was, with `asleep`."""
+        """Return edge.json of the room; of a sleeping one as it was, with `asleep`. Raises LookupError
+        if it has none."""
         losses = self._losses.current()
         if self._room is not None:
-            report = self._room.report()
-            return {**report, "trouble": [*losses, *report["trouble"]]} if losses else report
+            self._last_report = report = self._room.report()
+            return self._with_strangers({**report, "trouble": [*losses, *report["trouble"]]})
         trouble = [*losses, self._failure] if self._failure else losses
         if (took_s := self._thread.busy_s) >= _SLOW_S:
             what = "opening" if self._closing is None else "closing"
             trouble = [*trouble, f"{what} the map file has taken {took_s:.0f} s so far: nobody can enter"]
+        if not self._last_report:
+            raise LookupError("it fell asleep without a report")
         report = _aged(self._last_report, time.monotonic() - self._asleep_s)
         report.pop("loading", None)  # of a room that was never awake
-        return {**report, "refused": [], "trouble": trouble, "asleep": True}
+        refused = stranger_lines(self._strangers, time.monotonic_ns())
+        return self._with_strangers({**report, "refused": refused, "trouble": trouble, "asleep": True})
+
+    def _with_strangers(self, report: dict[str, Any]) -> dict[str, Any]:
+        counts = Counter(report.get("unjoined", {}))
+        counts.update(self._strangers.counts)
+        return {**report, "unjoined": dict(counts)}
 
 
 def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:
@@ -322,19 +357,3 @@ def _aged(report: dict[str, Any], more_s: float) -> dict[str, Any]:
 def _increased(fields: Mapping[str, Any], **more: float) -> dict[str, Any]:
     older = {name: round(fields[name] + n, 3) for name, n in more.items() if fields.get(name) is not None}
     return {**fields, **older}
-
-
-def _is_hello(event: PeerMessageReceived) -> bool:
-    try:
-        return message_type(event.frames) in (Hello, ClientHello)
-    except VersionError as error:  # it is to hear that
-        return refusal_of_version(error) is not None
-    except WireError:
-        return False
-
-
-def _ping_of(event: PeerMessageReceived) -> Ping | None:
-    try:
-        return decode_only(event.frames, Ping)
-    except WireError:
-        return None

@@ -24,7 +24,7 @@ from share.mapping.corrections import MapEvent
 from share.mapping.forgetting import DAY_S
 from share.mapping.places import FindKeyframe, KeyframeSought, PlaceNews
 from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
-from share.protocol.peer import Peer
+from share.protocol.peer import Faults, Peer, fault_lines
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.fault_guard import FaultGuard
@@ -47,6 +47,7 @@ from share.wire.layouts import Bytes
 from share.wire.messages import Refused
 
 _NO_ROOM = "no room of this site lets this name in: add it to `agents` of one in the rooms file"
+_STALE_REPORT = "no new report can be made: all values shown are old"
 _MAPS_S = 5.0  # period in which the building's graph forgets maps that are gone
 _MAX_VISITED = 2  # rooms at once, each a mapper that restores its map
 _VISIT_S = 120.0  # after which a visit, such as of a room that is never idle, takes no place any more
@@ -90,7 +91,7 @@ class SiteRooms:
         self._unvisited: deque[str] = deque()  # rooms whose places the directory does not have yet
         self._visits_s: dict[str, float] = {}  # when each room that is visited was woken up, monotonic
         self._maps_due_s = 0.0  # monotonic
-        self._refusals = Throttle(1.0, 5.0)
+        self._refusals, self._turned_away = Throttle(1.0, 5.0), Faults()  # of names that no room lets in
         self._guard = FaultGuard(lambda text: host.log_event("internal error", text))
         self._rooms: dict[str, RoomKeeper] = {}
         self._reports: dict[str, dict[str, Any]] = {}  # the last ones
@@ -146,6 +147,7 @@ class SiteRooms:
         room = self._switch.room_of(event.peer_id, event.frames)
         if room is None:
             self._host.send(event.peer_id, encode(Refused(_NO_ROOM)))
+            self._turned_away.add(_NO_ROOM, time.monotonic_ns())
             if (more := self._refusals.admit("", time.monotonic_ns())) is not None:
                 self._host.log_event("refused", f"{_NO_ROOM} (and {more} more)" if more else _NO_ROOM)
         else:
@@ -233,11 +235,24 @@ class SiteRooms:
 
     def report(self) -> dict[str, Any]:
         """Return edge.json of the whole site."""
-        self._reports = reports = {name: room.report() for name, room in self._rooms.items()}
+        for name, room in self._rooms.items():
+            self._update_report(name, room)
+        reports = self._reports
         directory = {"keyframes": len(self._directory), "waiting": self._thread.pending_jobs}
         report = site_report(reports, self._switch.building.poses)
         trouble = [*report["trouble"], *filter(None, [self._guard.trouble])]
-        return report | {"trouble": trouble, "room_changes": self._switch.changes, "directory": directory}
+        turned_away = "agents that no room lets in", "hellos refused", self._turned_away
+        refused = [*report["refused"], *fault_lines([turned_away], time.monotonic_ns())]
+        lines = {"trouble": trouble, "refused": refused}
+        return report | lines | {"room_changes": self._switch.changes, "directory": directory}
+
+    def _update_report(self, name: str, room: RoomKeeper) -> None:
+        """Make a room's report. A failure costs this one: the last one is shown, and says so."""
+        report = {**self._reports.get(name, {}), "trouble": [_STALE_REPORT]}
+        with self._guard.step(f"a report of room '{name}'"):  # the others are shown as they are
+            report = room.report()
+        if name in self._reports or "session" in report:  # else there never was one
+            self._reports[name] = report
 
     # ------------------------------------------------------------------ what rooms tell
 

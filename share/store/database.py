@@ -43,7 +43,8 @@ _ENVIRONMENT_ERRORS = (
     sqlite3.SQLITE_PERM,
 )
 
-DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError, UnicodeError)  # raised on damaged pages
+# What SQLite raises: on damaged pages, or since the machine fails (`is_damage` tells).
+DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError, UnicodeError)
 
 
 class DamageError(StoreError):
@@ -89,12 +90,28 @@ def translate_errors(path: Path, action: str, writes: bool = False) -> Iterator[
     except DAMAGE_ERRORS as error:
         if is_damage(error):
             raise DamageError(f"{path}: the map is damaged: {error}") from None
-        why = why_not_written(error, path) if writes else size_limit_message(error, path) or error
+        why = why_not_written(error, path) if writes else size_limit_message(error, path) or _text(error)
         raise StoreError(f"{path}: the map cannot be {action}: {why}") from None
 
 
+def _text(error: Exception) -> str:
+    return str(error) or "out of memory"  # a MemoryError has none
+
+
 def is_damage(error: Exception) -> bool:
-    return getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF not in _ENVIRONMENT_ERRORS
+    """Return whether one of DAMAGE_ERRORS is the file's fault."""
+    if isinstance(error, MemoryError):  # no size in a file asks for more than the file has
+        return False
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    is_cut = code == sqlite3.SQLITE_IOERR_SHORT_READ  # the file, or its log
+    return is_cut or code & 0xFF not in _ENVIRONMENT_ERRORS
+
+
+def check_damage(error: Exception) -> None:
+    """Raise the error unless it is the file's fault. One of the machine would pass for a loss, and half of
+    the file for all that is left of it."""
+    if not is_damage(error):
+        raise error
 
 
 def check_is_map(path: Path) -> bool:
@@ -122,7 +139,7 @@ def check_is_map(path: Path) -> bool:
 
 
 def _check_side_file(file: Path) -> None:
-    """Raises UsageError if the file exists and cannot be one of SQLite's."""
+    """Raises UsageError if the file exists and cannot be one of SQLite's, or be read."""
     what = "the log of a map" if file.suffix.endswith("-wal") else "the index of a map's log"
     if file.is_symlink():
         raise UsageError(f"{file}: is a link, but should be {what}; remove it")
@@ -131,7 +148,18 @@ def _check_side_file(file: Path) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise UsageError(f"{file}: cannot be {what}: {error.strerror}; remove it") from None
+        if is_other_kind(file):
+            raise UsageError(f"{file}: cannot be {what}: {error.strerror}; remove it") from None
+        raise UsageError(f"{file}: {what} cannot be read: {error.strerror}") from None
+
+
+def is_other_kind(file: Path) -> bool:
+    """Return whether there is something else than a regular file, such as a folder. Only that may be removed:
+    the log has what the map has not yet."""
+    try:
+        return not stat.S_ISREG(file.lstat().st_mode)
+    except OSError:
+        return False
 
 
 def is_blank(path: Path) -> bool:
@@ -173,7 +201,7 @@ def why_not_written(error: Exception, path: Path) -> str:
             os.fsync(file.fileno())
     except OSError as system:
         return system.strerror or str(system)
-    return str(error)
+    return _text(error)
 
 
 def size_limit_message(error: Exception, path: Path) -> str | None:
@@ -251,7 +279,8 @@ def lock_map(path: Path) -> int:
     try:
         handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise StoreError(f"{name}: cannot be locked: {error.strerror}; remove it") from None
+        remedy = "; remove it" if is_other_kind(name) else ""
+        raise StoreError(f"{name}: cannot be locked: {error.strerror}{remedy}") from None
     try:
         lock_handle(handle)
     except OSError:

@@ -121,7 +121,7 @@ class MapStore:
         except BaseException as error:
             with contextlib.suppress(sqlite3.Error):  # on a full disk SQLite has rolled back by itself
                 db.execute("ROLLBACK")
-            if isinstance(error, sqlite3.Error):
+            if isinstance(error, sqlite3.Error | MemoryError):
                 raise self._write_error(error) from None
             raise
         self._is_wiping |= any(isinstance(change, Wipe) for change in new_changes)
@@ -155,7 +155,7 @@ class MapStore:
             raise self._write_error(error) from None
         return not is_busy
 
-    def _write_error(self, error: sqlite3.Error) -> StoreError:
+    def _write_error(self, error: sqlite3.Error | MemoryError) -> StoreError:
         kind = DamageError if database.is_damage(error) else StoreError
         return kind(f"{self.path}: the map cannot be written: {why_not_written(error, self.path)}")
 
@@ -206,13 +206,21 @@ class MapStore:
         return replace(loaded, problems=self.problems or loaded.problems)
 
     def rows(self) -> ReadRows:
-        """Return all rows but images and views: as `open` read them, or read again after a change. Raises
-        StoreError."""
+        """Return all rows but images and views: as `open` read them, or read again after a change. A file
+        that turns out to be damaged is repaired first, as by `open`. Raises StoreError."""
         if self._opened is not None:
             return self._opened
         if self._db is None:
             return read_only(self.path).rows
-        return read_intact_rows(self._db, schema.SMALL_TABLES)
+        if (read_rows := self._read_rows(schema.SMALL_TABLES)).is_damaged:
+            self._check_in_place()
+            self._repair()
+            read_rows = self._read_rows(schema.SMALL_TABLES)
+        return read_rows
+
+    def _read_rows(self, tables: Iterable[str]) -> ReadRows:
+        with database.translate_errors(self.path, "read"):
+            return read_intact_rows(self._writable_db(), tables)
 
     def set_aside(self, forgotten: Mapping[str, int]) -> Path:
         """Rename the map and start an empty one in its place, which knows the removed runs too. Return the
@@ -221,7 +229,7 @@ class MapStore:
 
         Raises ShareError if that fails: then the map is unchanged, or the new one knows none.
         """
-        about = read_intact_rows(self._writable_db(), ["about"]).tables["about"]
+        about = self._read_rows(["about"]).tables["about"]
         self._writable_db().close()
         try:
             renamed = set_aside(self.path)
@@ -235,12 +243,13 @@ class MapStore:
 
     def close(self) -> None:
         """Checkpoint the log and unlock the file."""
-        if self._db is not None:
-            self._db.close()
-            self._db = None
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        db, lock, self._db, self._lock = self._db, self._lock, None, None
+        try:
+            if db is not None:
+                db.close()
+        finally:
+            if lock is not None:
+                os.close(lock)
 
     def abandon(self) -> None:
         """Give up the file without closing it, while another thread hangs in `write`. The lock ends with the

@@ -20,7 +20,7 @@ from share.files.sqlite_file import wal_path
 from share.files.writing import open_new, sync_folder, write_errors
 from share.store import database, rows, schema
 from share.store.conversion import move_images
-from share.store.database import DAMAGE_ERRORS
+from share.store.database import DAMAGE_ERRORS, check_damage
 from share.store.rows import COLUMNS, Row, insert, is_intact
 from share.store.schema import PAGE_BYTES, own_tables
 
@@ -57,11 +57,11 @@ def temporary_copy(path: Path, folder: Path | None = None) -> Iterator[Path]:
 
 def read_damaged(path: Path, folder: Path | None = None) -> ReadRows:
     """Read the intact rows of a damaged file, from a copy, as it is or with a new first page, whichever
-    yields most.
+    yields most. Raises ShareError if the disk is full or fails, or memory is short.
 
     The first page locates the tables. It is the same in all maps of a schema, except for counters.
     """
-    with temporary_copy(path, folder) as copy:
+    with temporary_copy(path, folder) as copy, database.translate_errors(path, "read"):
         best = _read_copy(copy)
         wal_path(copy).unlink(missing_ok=True)
         for version in (schema.SCHEMA, schema.OLDEST_SCHEMA):
@@ -186,7 +186,8 @@ class ReadRows:
 
 
 def read_intact_rows(connection: sqlite3.Connection, tables: Iterable[str] = tuple(COLUMNS)) -> ReadRows:
-    """Read all rows of our own tables that are readable and have a correct CRC; count the others."""
+    """Read all rows of our own tables that are readable and have a correct CRC; count the others. Raises what
+    SQLite does where the machine fails."""
     read_rows, own = ReadRows(), _own_tables(connection)
     for table in tables:
         if table in schema.ADDED_TABLES and table not in own:  # the file is of an older schema
@@ -219,7 +220,8 @@ def merge_run_copies(read_rows: ReadRows) -> ReadRows:
 def _own_tables(connection: sqlite3.Connection) -> set[str]:
     try:
         return own_tables(connection)
-    except DAMAGE_ERRORS:
+    except DAMAGE_ERRORS as error:
+        check_damage(error)
         return set()
 
 
@@ -245,7 +247,8 @@ def _max_row_count(connection: sqlite3.Connection) -> int:
     """Return how many rows the file has room for."""
     try:
         (pages,) = connection.execute("PRAGMA page_count").fetchone()
-    except DAMAGE_ERRORS:
+    except DAMAGE_ERRORS as error:
+        check_damage(error)
         return MAX_PROBES
     return int(pages) * PAGE_BYTES // _MIN_ROW_BYTES
 
@@ -257,7 +260,8 @@ def _read_query(
     try:
         for number, *row in connection.execute(query, values):
             rows[number] = tuple(row)
-    except DAMAGE_ERRORS:
+    except DAMAGE_ERRORS as error:
+        check_damage(error)
         return False
     return True
 
@@ -266,5 +270,6 @@ def _count_rows(connection: sqlite3.Connection, table: str) -> int | None:
     """Return the number of rows by an index, another part of the file; None if that is unreadable too."""
     try:
         return int(connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
-    except DAMAGE_ERRORS:
+    except DAMAGE_ERRORS as error:
+        check_damage(error)
         return None

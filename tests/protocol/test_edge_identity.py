@@ -12,14 +12,17 @@ from helpers.hellos import hello_of
 from share.agent_names import checked_name
 from share.checks import MAX_ID
 from share.config import Config
+from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import SaveCredential
 from share.protocol import edge_events as ed
+from share.protocol.common_events import Tick
 from share.protocol.edge import EdgeProtocol
 from share.protocol.keyframe_intake import OdometryBase
 from share.protocol.peer import RestoredRun
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
+from share.wire.room_messages import ClientHello
 
 SECRET = 0x0123_4567_89AB_CDEF
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -68,12 +71,24 @@ def test_a_run_is_not_to_blame_for_who_uses_it_with_another_s_key() -> None:
 
 def test_a_key_is_authorised_for_its_names_only() -> None:
     edge = EdgeProtocol(Config(), 7)
-    (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
+    (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE, key="of eve"))
     assert isinstance(refused, m.Refused)
     assert "authorized for 'eve', 'mallory', not for 'ann'" in refused.reason
     assert "share keys authorize" in refused.reason
     welcome, _ = sent(tell(edge, hello_of("eve", SECRET), EVE))
     assert isinstance(welcome, m.Welcome)
+
+
+def test_without_keys_nobody_is_told_of_keys() -> None:
+    """In a room of a site, whose rooms file names who may be there."""
+    edge = EdgeProtocol(Config(), 7)
+    why = "this room is for 'eve', 'mallory', not for 'ann': see `agents` of the room in the rooms file"
+    assert sent(tell(edge, hello_of("ann", SECRET), EVE)) == [m.Refused(why)]
+    tell(edge, hello_of("eve", SECRET), EVE)
+    for message in (hello_of("eve", SECRET), ClientHello("ann", 5)):
+        (refused,) = sent(tell(edge, message, ANN if message.name == "eve" else EVE, peer=message.run_id))
+        assert isinstance(refused, m.Refused) and refused.reason.endswith("in the rooms file")
+    assert "key" not in str(edge.report({})["unjoined"]) + str(edge.report({})["refused"])
 
 
 def test_a_run_is_not_taken_over_by_another_key() -> None:
@@ -192,3 +207,42 @@ def test_labels_of_earlier_runs_are_unique() -> None:
     agents = edge.report({})["agents"]
     assert len(agents) == 12
     assert len({agent["run"] for agent in agents.values()}) == 12
+
+
+def restored(*runs: tuple[str, int]) -> list[RestoredRun]:
+    """Runs of a map file, each with a keyframe."""
+    base = OdometryBase.from_keyframe(keyframe(2))
+    return [RestoredRun(f"{name}-0001", hello_of(name, run_id), base) for name, run_id in runs]
+
+
+def test_a_hello_with_another_run_id_than_its_connection_is_refused() -> None:
+    """A restarted edge knows a run by the id in its hello, so two of them would have been one."""
+    edge = EdgeProtocol(Config(), 7)
+    (refused,) = sent(tell(edge, hello_of("eve", 5), None, peer=SECRET))
+    assert isinstance(refused, m.Refused) and "another run id than its connection" in refused.reason
+    assert edge.report({})["agents"] == {}
+    welcome, _ = sent(tell(edge, hello_of("eve", SECRET), None))
+    assert isinstance(welcome, m.Welcome)
+    (refused,) = sent(tell(edge, hello_of("eve", 5), None, peer=SECRET))  # of a run that is known too
+    assert isinstance(refused, m.Refused)
+
+
+def test_two_runs_of_a_map_file_with_one_id_are_two_runs_and_can_both_be_forgotten() -> None:
+    """Every report failed for good, and nothing was acknowledged any more."""
+    edge = EdgeProtocol(Config(), 7, restored=restored(("eve", 5), ("mallory", 5)))
+    assert edge.report({})["agents"].keys() == {"eve", "mallory"}
+    empty = tuple(KeyframeKey(f"{name}-0001", 2) for name in ("eve", "mallory"))
+    edge.handle(ed.MapperResult((), (), empty), 0)
+    effects = edge.handle(Tick(), 0)
+    assert {one.key for one in of(effects, ed.DropRun)} == {"eve-0001", "mallory-0001"}
+    report = edge.report({})
+    assert (report["internal_errors"], report["agents"], report["unlisted_runs"]) == (0, {}, 0)
+    (welcome, *_) = sent(tell(edge, hello_of("bob", 9), None, peer=9))
+    assert isinstance(welcome, m.Welcome)
+
+
+def test_of_two_runs_with_one_id_the_first_goes_on() -> None:
+    edge = EdgeProtocol(Config(), 7, restored=restored(("eve", 5), ("mallory", 5)))
+    assert sent(tell(edge, hello_of("eve", 5), None, peer=5))[0] == m.Welcome(7, 3)
+    (refused,) = sent(tell(edge, hello_of("mallory", 5), None, peer=5))
+    assert isinstance(refused, m.Refused) and "in use by 'eve'" in refused.reason

@@ -279,6 +279,28 @@ def test_a_damaged_map_stays_a_loss_until_its_copy_is_moved_away(path):
     assert restarts_of(path) == []
 
 
+def test_damage_that_a_restart_meets_is_said(tmp_path):
+    path, said = tmp_path / "room.sqlite", []
+    with MapStore.open(path) as store:
+        restarts = MapperRestarts(store, 0.05, said.append)
+        store.write(small_map(300, 60))
+        store.compact()
+        restarts.load_map()
+        assert (said, restarts.losses) == ([], [])
+        with path.open("r+b") as file:
+            for page in range(40, 90, 3):
+                file.seek(page * PAGE_BYTES)
+                file.write(b"\xa5" * PAGE_BYTES)
+        restore, known = restarts.load_map()
+        lost = 600 - len(restore.rows.tables["keyframe"])
+        assert lost and len(known) == 2
+        assert said[0].startswith("the file was damaged; it is kept as room.sqlite.damaged-1")
+        assert f"{lost} keyframes could not be read" in said
+        assert restarts.losses == [f"map room.sqlite: {line}" for line in said]
+        restarts.load_map()
+        assert len(said) == len(restarts.losses)
+
+
 def test_a_long_list_of_kept_files_is_one_line(path):
     for number in range(1, 6):
         path.with_name(f"room.sqlite.damaged-{number}").touch()

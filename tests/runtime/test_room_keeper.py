@@ -25,8 +25,11 @@ from share.runtime import room_jobs, room_keeper
 from share.runtime.room_keeper import RoomKeeper, RoomStart
 from share.store import database
 from share.store.map_store import MapStore
+from share.store.schema import PAGE_BYTES
+from share.wire import codec
 from share.wire.codec import decode, encode
-from share.wire.messages import NO_SESSION, Ping, Pong, peer_id
+from share.wire.messages import NO_SESSION, Bye, Ping, Pong, peer_id
+from share.wire.room_messages import ClientHello
 
 ANN, BOB = hello_of("ann", 1), hello_of("bob", 2)
 
@@ -240,6 +243,75 @@ def test_only_a_hello_or_somebody_it_knows_wakes_it(bench):
     assert len(bench.rooms[1].handled) == 1
 
 
+def header_of(message, version=codec.WIRE_VERSION) -> bytes:
+    """A header that says such a message, without anything in it."""
+    _, code, *_ = msgspec.msgpack.decode(encode(message)[0])
+    return msgspec.msgpack.encode([version, code, [], []])
+
+
+JUNK = [bytes(64_000)] * 16
+
+
+def test_what_only_claims_to_be_a_hello_is_not_kept(bench):
+    """Of a room that could not open, 70 MB were."""
+    bench.step_until(is_awake=False)
+    for sent in (header_of(ANN), header_of(ClientHello("ann", 1))):
+        bench.keeper.handle(PeerMessageReceived(peer_id(BOB.run_id), [sent, *JUNK]))
+    assert not bench.keeper._messages and not bench.keeper._is_called
+    bench.keeper.handle(PeerMessageReceived(peer_id(BOB.run_id), [header_of(ANN, version=1), *JUNK]))
+    ((_, kept),) = bench.keeper._messages
+    assert len(kept.frames) == 1  # it is to hear which side to upgrade, whatever else it sends
+
+
+def test_of_one_that_it_knows_too_only_hellos_and_pings_are_kept(bench):
+    bench.keeper.handle(hello(ANN))
+    bench.step_until(is_awake=False)
+    bench.keeper.handle(PeerMessageReceived(peer_id(ANN.run_id), [b"\xff", *JUNK]))
+    bench.keeper.handle(PeerMessageReceived(peer_id(ANN.run_id), [header_of(Bye()), *JUNK]))
+    assert not bench.keeper._messages
+    bench.step_until(is_awake=True)
+
+
+def test_what_a_sleeping_room_is_sent_in_vain_is_counted_and_said(bench, monkeypatch):
+    def handle(frames: list[bytes]) -> None:
+        bench.keeper.handle(PeerMessageReceived(peer_id(BOB.run_id), frames))
+
+    before = bench.keeper.report()["unjoined"]
+    bench.step_until(is_awake=False)
+    for _ in range(20):
+        handle([b"\xff"])
+        handle([bytes(one) for one in encode(Bye())])
+    handle([header_of(Ping(1, 1), version=1)])
+    report = bench.keeper.report()
+    (line,) = report["refused"]
+    assert line.startswith("peers that have not joined: 40 messages refused, the last: a message Bye before")
+    counts = {"bad_messages": 20, "unexpected": 20, "other_version": 1}
+    assert (before, report["unjoined"]) == ({}, counts)
+    bench.keeper.handle(hello())
+    bench.step_until(is_awake=True)
+    monkeypatch.setattr(FakeRoom, "report", lambda room: {"unjoined": {"bad_messages": 3}, "trouble": []})
+    for _ in range(2):
+        assert bench.keeper.report()["unjoined"] == {**counts, "bad_messages": 23}
+
+
+def test_damage_that_is_found_when_it_wakes_up_is_said_once(bench, tmp_path):
+    path = tmp_path / "room.sqlite"
+    bench.rooms[0].store.write(small_map(60, 60))
+    bench.step_until(is_awake=False)
+    with path.open("r+b") as file:
+        for page in range(6, 30, 3):
+            file.seek(page * PAGE_BYTES)
+            file.write(b"\xa5" * PAGE_BYTES)
+    for _ in range(2):
+        bench.keeper.handle(hello())
+        bench.step_until(is_awake=True)
+        bench.step_until(is_awake=False)
+    repaired, *lost = bench.lines
+    assert repaired.startswith("the file was damaged; it is kept as room.sqlite.damaged-1")
+    assert any("could not be read" in line for line in lost)
+    assert len(set(bench.lines)) == len(bench.lines)
+
+
 def test_a_message_that_comes_while_it_falls_asleep_is_not_lost(bench):
     bench.keeper.step()
     assert bench.is_awake is None
@@ -302,6 +374,18 @@ def test_a_sleeping_room_is_shown_as_it_was(bench):
     assert "loading" not in report
     assert bench.keeper.may_have_map("ann/0")
     assert report["trouble"] == report["refused"] == []
+
+
+def test_a_room_whose_report_fails_falls_asleep_and_is_shown_as_it_was(bench, monkeypatch):
+    shown = bench.keeper.report()
+
+    def fail(room):
+        raise KeyError("a run")
+
+    monkeypatch.setattr(FakeRoom, "report", fail)
+    bench.step_until(is_awake=False)
+    assert bench.keeper.report()["maps"] == shown["maps"]
+    assert any("its last report: KeyError" in line for line in bench.lines)
 
 
 def test_the_ages_of_a_sleeping_room_grow(bench):

@@ -19,7 +19,7 @@ from share.runtime.edge_observer import EdgeObservers
 from share.runtime.site_rooms import RoomSetup, SiteRooms
 from share.store.map_store import MapStore
 from share.wire.codec import decode, encode
-from share.wire.messages import Welcome, peer_id
+from share.wire.messages import Refused, Welcome, peer_id
 
 
 class Host:
@@ -91,6 +91,40 @@ def test_a_mistake_in_one_room_is_said_and_costs_the_others_nothing(monkeypatch)
     assert line.startswith("internal error: room 'hall': KeyError")
     assert (site.close() or "").startswith("room 'hall': KeyError: 'another'")
     assert all(room.room.is_closed for room in site._rooms.values())
+
+
+def test_a_room_whose_report_fails_is_shown_as_it_was(monkeypatch) -> None:
+    """One such room froze the page of all."""
+    monkeypatch.setattr(site_rooms, "ServedRoom", Room)
+    setups = [RoomSetup(name, Config(), None, EdgeObservers()) for name in ("hall", "lab")]
+    host = Host()
+    site = SiteRooms(host, setups, time.monotonic_ns(), False)
+    assert site.report()["trouble"] == []
+
+    def fail() -> None:
+        raise KeyError(b"a run")
+
+    monkeypatch.setattr(site._rooms["hall"].room, "report", fail)
+    report = site.report()
+    assert report["rooms"].keys() == {"hall", "lab"}
+    stale, mistake = report["trouble"]
+    assert stale == "room 'hall': no new report can be made: all values shown are old"
+    assert mistake.startswith("internal error: a report of room 'hall': KeyError")
+    assert len(site.report()["trouble"]) == 2
+    site.close()
+
+
+def test_hellos_of_whom_no_room_lets_in_are_counted(monkeypatch) -> None:
+    monkeypatch.setattr(site_rooms, "ServedRoom", Room)
+    setups = [RoomSetup("hall", Config(), None, EdgeObservers(), frozenset({"ann"}))]
+    host = Host()
+    site = SiteRooms(host, setups, time.monotonic_ns(), False)
+    for k in range(30):
+        site.handle(PeerMessageReceived(peer_id(k), [bytes(f) for f in encode(hello_of("eve", k))]))
+    assert {type(one) for one in host.sent} == {Refused}
+    (line,) = site.report()["refused"]
+    assert line.startswith("agents that no room lets in: 30 hellos refused, the last: no room of this site")
+    site.close()
 
 
 def test_each_room_is_shown_its_own_report(monkeypatch) -> None:

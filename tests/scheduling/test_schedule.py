@@ -28,13 +28,13 @@ CONTROL = ControlConfig(ar_target=0.8)
 
 def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> EdgeProtocol:
     edge = EdgeProtocol(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
-    edge.handle(ed.PeerMessageReceived(b"a", encode(hello_of("ann", 5, kind))), 0)
+    edge.handle(ed.PeerMessageReceived(m.peer_id(5), encode(hello_of("ann", 5, kind))), 0)
     return edge
 
 
 def rates(edge: EdgeProtocol, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
     told = encode(m.Evaluation(0, delay_ms, error_cm, rtt_ms=delay_ms))
-    effects = edge.handle(ed.PeerMessageReceived(b"a", told), now_ms * MS)
+    effects = edge.handle(ed.PeerMessageReceived(m.peer_id(5), told), now_ms * MS)
     said = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.SendToPeer)]
     return [message.hz for message in said if isinstance(message, m.Rate)]
 
@@ -67,11 +67,11 @@ def test_a_new_run_starts_without_history() -> None:
     told = [hz for i in range(20) for hz in rates(edge, 15.0, 0.1, 200 * i)]
     assert told == sorted(told, reverse=True) and len(told) < 20  # an unchanged rate is not sent again
     last = told[-1]
-    edge.handle(ed.PeerMessageReceived(b"a", encode(m.Bye())), 4000 * MS)
-    edge.handle(ed.PeerMessageReceived(b"b", encode(hello_of("ann", 6))), 4001 * MS)
+    edge.handle(ed.PeerMessageReceived(m.peer_id(5), encode(m.Bye())), 4000 * MS)
+    edge.handle(ed.PeerMessageReceived(m.peer_id(6), encode(hello_of("ann", 6))), 4001 * MS)
     reported = edge.report({})["agents"]
     assert [agent["qoe"] for agent in reported.values()] == [None, None]  # the new run's, and the old one's
-    effects = edge.handle(ed.PeerMessageReceived(b"b", encode(m.Evaluation(0, 15.0, 0.1))), 4100 * MS)
+    effects = edge.handle(ed.PeerMessageReceived(m.peer_id(6), encode(m.Evaluation(0, 15.0, 0.1))), 4100 * MS)
     (first,) = [decode([bytes(f) for f in e.frames]).hz for e in effects if isinstance(e, ed.SendToPeer)]
     assert first > last
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.map_changes import ANN, BOB, as_values, keyframe, run, small_map, solution
 
-from share.errors import ShareError
+from share.errors import ShareError, StoreError
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveKeyframes, SaveLink
 from share.store import salvage
@@ -269,3 +269,119 @@ def test_a_damaged_log_costs_what_comes_after(tmp_path):
         assert kept.next_ids.get(ANN, 0) == len(numbers)
         lost.append(40 - len(numbers))
     assert 0 < max(lost) <= 40
+
+
+def overwrite_pages(path, numbers):
+    """As a failing disk does while the map is open: it cannot be read there again."""
+    with path.open("r+b") as file:
+        for number in numbers:
+            file.seek(number * PAGE_BYTES)
+            file.write(b"\xa5" * PAGE_BYTES)
+
+
+@pytest.fixture
+def large(tmp_path):
+    """An open map of many pages, which has changed since it was opened, and its path."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        store.write(small_map(300, 60))
+    with MapStore.open(path) as store:
+        store.write([keyframe(ANN, 300)])
+        store.compact()
+        yield store, path
+
+
+def test_damage_that_comes_while_the_map_is_open_is_repaired_and_said(large):
+    """A mapper that was restarted then lacked keyframes without a word."""
+    store, path = large
+    whole = store.rows()
+    assert not whole.is_damaged and store.problems == ()
+    overwrite_pages(path, range(40, 90, 3))
+    read_rows = store.rows()
+    assert not read_rows.is_damaged
+    lost = len(whole.tables["keyframe"]) - len(read_rows.tables["keyframe"])
+    assert store.problems[0].startswith("the file was damaged; it is kept as room.sqlite.damaged-1")
+    assert lost and f"{lost} keyframes could not be read" in store.problems
+    store.write([keyframe(ANN, 301)])
+    assert len(store.rows().tables["keyframe"]) == len(read_rows.tables["keyframe"]) + 1
+
+
+def test_a_file_that_was_replaced_is_not_repaired_in_its_place(large, whole):
+    store, path = large
+    overwrite_pages(path, range(40, 90, 3))
+    path.unlink()
+    path.write_bytes(whole[0])
+    with pytest.raises(StoreError, match="was replaced while the edge ran"):
+        store.rows()
+    assert path.read_bytes() == whole[0]
+
+
+class FailingConnection:
+    """A connection that fails at the query of this number."""
+
+    def __init__(self, connection, error, number):
+        self._connection, self._error, self._left = connection, error, number
+
+    def execute(self, *query):
+        self._left -= 1
+        if self._left == 0:
+            raise self._error
+        return self._connection.execute(*query)
+
+    def close(self):
+        self._connection.close()
+
+
+def of_sqlite(code):
+    error = sqlite3.OperationalError("it fails")
+    error.sqlite_errorcode = code
+    return error
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 5])
+@pytest.mark.parametrize(
+    "error",
+    [of_sqlite(sqlite3.SQLITE_IOERR_READ), of_sqlite(sqlite3.SQLITE_BUSY), MemoryError()],
+    ids=["io", "busy", "memory"],
+)
+def test_a_machine_that_fails_for_a_moment_costs_no_rows(tmp_path, error, number):
+    """Half of the map was restored, as if the rest were lost."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        read_rows, connection = store.rows(), store._db
+        store._db = FailingConnection(connection, error, number)
+        with pytest.raises(StoreError, match=r"the map cannot be read: (it fails|out of memory)"):
+            store.rows()
+        store._db = connection
+        assert store.rows().tables == read_rows.tables
+    assert not path.with_name("room.sqlite.damaged-1").exists()
+
+
+def test_a_change_for_which_memory_is_short_is_not_taken_for_faulty(tmp_path):
+    """It was skipped, and its keyframe acknowledged."""
+    path = tmp_path / "room.sqlite"
+    with MapStore.open(path) as store:
+        connection = store._db
+        store._db = FailingConnection(connection, MemoryError(), 2)
+        with pytest.raises(StoreError, match="the map cannot be written: out of memory"):
+            store.write(small_map())
+        store._db = connection
+        store.write(small_map())
+        assert len(store.load().keyframes) == 40
+
+
+def test_short_memory_while_a_file_is_opened_does_not_make_it_damaged(whole, tmp_path, monkeypatch):
+    path = tmp_path / "room.sqlite"
+    path.write_bytes(whole[0])
+
+    def fails(*_):
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(salvage, "own_tables", fails)
+        with pytest.raises(StoreError, match="out of memory"):
+            MapStore.open(path)
+    assert path.read_bytes() == whole[0]
+    with MapStore.open(path) as store:
+        assert as_values(store.load()) == whole[1]

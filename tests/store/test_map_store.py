@@ -410,6 +410,30 @@ def test_side_files_of_a_map_must_be_regular_files(path, end, kind, made):
     assert reopened(path) is not None
 
 
+@pytest.mark.parametrize("code", [errno.EMFILE, errno.EACCES])
+@pytest.mark.parametrize("end", ["-wal", "-shm", ".lock"])
+def test_a_side_file_that_cannot_be_opened_is_not_to_be_removed(path, monkeypatch, code, end):
+    """The log had all keyframes."""
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        copy = path.with_name("killed.sqlite")
+        for side in ("", "-wal", "-shm"):
+            shutil.copy(path.with_name(path.name + side), copy.with_name(copy.name + side))
+        copy.with_name(copy.name + ".lock").touch()
+    open_file = os.open
+
+    def fails(name, *arguments, **more):
+        if str(name).endswith(end):
+            raise OSError(code, os.strerror(code), str(name))
+        return open_file(name, *arguments, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", fails)
+        with pytest.raises((UsageError, StoreError), match=rf"{end}: .*{os.strerror(code)}$"):
+            MapStore.open(copy)
+    assert len(reopened(copy).keyframes) == 40
+
+
 LIMITED = """
 import resource, sys
 from pathlib import Path
