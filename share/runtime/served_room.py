@@ -155,7 +155,11 @@ class ServedRoom:
 
     def close_file(self, timeout_s: float = CLOSE_S) -> str | None:
         """Close the map file; see `MapWriter.close`. Return why it is incomplete, None if it is complete."""
-        return None if self._map_writer is None else self._map_writer.close(timeout_s)
+        if self._map_writer is not None:
+            return self._map_writer.close(timeout_s)
+        if self.is_waiting and self._restarts.store is not None:  # no session could begin: unlock it
+            self._restarts.store.close()
+        return None
 
     def finish(self, incomplete_reason: str | None) -> None:
         """Acknowledge what has been saved at the end."""

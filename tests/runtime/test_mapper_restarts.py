@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.map_changes import ANN, BOB, small_map
+from helpers.map_files import is_locked
 
 from share.config import Config, EdgeConfig
 from share.errors import StoreError
@@ -497,9 +498,21 @@ def test_a_restart_that_fails_is_tried_again_after_a_pause(path, quick, monkeypa
     monkeypatch.setattr(MapperRestarts, "load_map", failing)
     started[0][0]("was ended by SIGKILL")
     until(lambda: room.step() or not (room.is_waiting or len(started) < 2))
-    assert np.all(np.diff(tries) >= [0.01, 0.02, 0.04])
+    assert np.all(np.diff(tries) >= [0.005, 0.01, 0.02])  # pauses double
     assert [delay_s for _, delay_s in started] == [0.0, 0.0]  # it has waited
     assert room.close() is None
+
+
+def test_a_room_that_waits_for_its_map_unlocks_the_file_at_the_end(path, quick, monkeypatch):
+    started: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
+    monkeypatch.setattr(served_room, "MapWriter", lambda *_: {}["none"])
+    started[0]("was ended by SIGKILL")
+    room.step()
+    assert room.is_waiting
+    assert is_locked(path)
+    assert room.close() is None
+    assert not is_locked(path)
 
 
 def test_a_session_goes_on_without_what_nobody_needs_only(path, quick):
