@@ -165,9 +165,10 @@ class ImuPredictor:
         return self.buffer.between(from_ns, to_ns, _SILENT_NS)
 
     def restart(self, state: FilterState) -> None:
-        """Begin with a new state: its rate is that of the newest sample."""
+        """Begin with a new state: its rate is that of the newest sample, unless the IMU is silent."""
         gyro = self.buffer.samples.gyro
-        self.rate = gyro[-1] - state.bg if len(gyro) else np.zeros(3)
+        is_known = len(gyro) > 0 and self.buffer.last_ns >= state.stamp_ns - _SILENT_NS
+        self.rate = gyro[-1] - state.bg if is_known else np.zeros(3)
 
     def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuStatus:
         """Propagate the state to `to_ns`, IMU time.

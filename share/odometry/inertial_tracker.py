@@ -69,6 +69,7 @@ class InertialTracker:
             raise ValueError("the rig has no IMU; use VisualTracker")
         self._rig, self._config = rig, config
         self._bias = initialisation.unknown_bias(config) if bias is None else bias
+        self._has_bias, self.has_dropped_bias = bias is not None, False  # dropped: contradicted at rest
         self._imu = ImuPredictor(rig.imu, config)
         self._rest = RestDetector()
         self._landmarks: LandmarkMap | None = None
@@ -228,6 +229,9 @@ class InertialTracker:
         """Return a state at odom's origin, z up: by the IMU, or after frames without a sample by the camera
         alone; None while samples may still come."""
         samples = self._imu.buffer.samples
+        if self._has_bias and initialisation.rest_contradicts(self._bias, samples, self._config):
+            self._bias, self._has_bias = initialisation.unknown_bias(self._config), False
+            self.has_dropped_bias = True
         state = initialisation.state_from_imu(stamp_ns, samples, self._rig, self._config, self._bias)
         self._knows_up = state is not None
         if state is not None:
