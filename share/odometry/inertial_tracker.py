@@ -307,7 +307,9 @@ class InertialTracker:
         """Return whether the state is plausible, and the images do not contradict it for long."""
         in_view, found_count = matches.in_view_count(self._rig.cam0), int(matches.is_found.sum())
         self._divergence.add(is_textured, in_view, found_count, count, interval_ns * 1e-9)
-        return not self._divergence.has_diverged and is_plausible(s, self._config.max_speed_m_s)
+        return not self._divergence.has_diverged and is_plausible(
+            s, self._config.max_speed_m_s, self._divergence.blind_drift_m
+        )
 
     def _advance_mono_window(self, frame: Frame, landmarks: LandmarkMap, is_keyframe: bool) -> bool:
         """Return whether a single camera's window gives the scale, and the state has converged. is_keyframe:
@@ -338,6 +340,7 @@ class InertialTracker:
             cov = se3.compose_cov(se3.inverse(s.T_origin) @ s.T, self._start_cov, cov)
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
+            self._divergence.add_keyframe(filter.drift_m(s), count)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < MIN_OK_FEATURES, publish)
         is_ready = self._keyframes.is_ready
         return TrackResult(
