@@ -426,3 +426,13 @@ def test_a_recording_whose_clock_begins_at_zero(walk):
     tracker.track(first)
     assert tracker.track(second).state is not TrackState.LOST
     assert tracker.state is not None
+
+
+def test_a_camera_that_sticks_while_the_imu_moves_does_not_stay_blind_for_ever(walk, monkeypatch):
+    """Each blind keyframe would begin the drift anew."""
+    monkeypatch.setattr("share.odometry.health._MAX_DRIFT_M", 0.004)
+    stuck = walk[0][15]
+    frames = some(walk[0], lambda f: dataclasses.replace(f, image0=stuck.image0), 16, 45)
+    results, _, _ = run(walk, frames)
+    blind = states(results).index(BLIND)
+    assert LOST in states(results)[blind:]
