@@ -105,7 +105,9 @@ def is_plausible(s: FilterState, max_speed_m_s: float, blind_drift_m: float) -> 
     """Return whether the state is finite, not too fast, and its drift since the newest keyframe with features
     small. blind_drift_m: from there to the newest keyframe."""
     finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
-    return bool(finite and np.linalg.norm(s.v) < max_speed_m_s and blind_drift_m + filter.drift_m(s) < _MAX_DRIFT_M)
+    return bool(
+        finite and np.linalg.norm(s.v) < max_speed_m_s and blind_drift_m + filter.drift_m(s) < _MAX_DRIFT_M
+    )
 
 
 def pose_state(count: int, has_imu: bool) -> TrackState:

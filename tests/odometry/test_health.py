@@ -67,13 +67,17 @@ def test_frames_with_inliers_make_up_for_as_many_without(monitor: DivergenceMoni
         assert not monitor.has_diverged
 
 
-def test_drift_since_the_newest_keyframe_with_features_is_the_sum_since_then(monitor: DivergenceMonitor) -> None:
+def test_drift_since_the_newest_keyframe_with_features_is_the_sum_since_then(
+    monitor: DivergenceMonitor,
+) -> None:
     monitor.add_keyframe(0.2, MANY)
     assert monitor.blind_drift_m == 0.0
     for _ in range(2):
         monitor.add_keyframe(0.2, 5)
     assert monitor.blind_drift_m == pytest.approx(0.4)
-    state = initial_state(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(4), np.full(CORE_SIZE, 0.09))
+    state = initial_state(
+        0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(4), np.full(CORE_SIZE, 0.09)
+    )
     add_keyframe(state, 0, np.zeros(3))
     state.cov[POSE.start + 3, POSE.start + 3] += 0.2**2  # moved since
     assert is_plausible(state, 8.0, 0.2)

@@ -14,7 +14,7 @@ STEP_NS = 5_000_000
 
 
 def measured(count: int = 400) -> np.ndarray:
-    return np.random.default_rng(4).normal(0, 0.01, (count, 6)) + [0, 0, 0, 0, 0, 9.81]
+    return np.random.default_rng(4).normal(0, 0.01, (count, 6)) + np.eye(6)[5] * 9.81
 
 
 def dropped(values: np.ndarray, frame: int) -> list[int]:
