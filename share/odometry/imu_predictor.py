@@ -167,8 +167,12 @@ class ImuPredictor:
     def restart(self, state: FilterState) -> None:
         """Begin with a new state: its rate is that of the newest sample, unless the IMU is silent."""
         gyro = self.buffer.samples.gyro
-        is_known = len(gyro) > 0 and self.buffer.last_ns >= state.stamp_ns - _SILENT_NS
+        is_known = len(gyro) > 0 and not self.has_fallen_silent(state.stamp_ns)
         self.rate = gyro[-1] - state.bg if is_known else np.zeros(3)
+
+    def has_fallen_silent(self, now_ns: int) -> bool:
+        """Return whether samples came, but none of late."""
+        return len(self.buffer.samples) > 0 and self.buffer.last_ns < now_ns - _SILENT_NS
 
     def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuStatus:
         """Propagate the state to `to_ns`, IMU time.

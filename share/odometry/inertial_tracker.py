@@ -195,7 +195,7 @@ class InertialTracker:
         if T_odom_cam is None and self._awaits_relocalisation(frame.stamp_ns):
             return TrackResult(TrackState.LOST, None)
         waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
-        state = self._first_state(frame.stamp_ns)
+        state = self._first_state(frame.stamp_ns, T_odom_cam is not None)
         if state is None:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.IMU)
         if T_odom_cam is not None:
@@ -225,9 +225,9 @@ class InertialTracker:
             return False
         return 0 < stamp_ns - self._lost_ns < relocalisation.NEW_SEGMENT_S * 1e9
 
-    def _first_state(self, stamp_ns: int) -> FilterState | None:
+    def _first_state(self, stamp_ns: int, is_found: bool) -> FilterState | None:
         """Return a state at odom's origin, z up: by the IMU, or after frames without a sample by the camera
-        alone; None while samples may still come."""
+        alone; None while samples may still come. is_found: relocalised, so the map tells what is up."""
         samples = self._imu.buffer.samples
         if self._has_bias and initialisation.rest_contradicts(self._bias, samples, self._config):
             self._bias, self._has_bias = initialisation.unknown_bias(self._config), False
@@ -237,7 +237,8 @@ class InertialTracker:
         if state is not None:
             return state
         self._imu_wait_frames += 1
-        if self._imu_wait_frames < _MAX_IMU_WAIT_FRAMES:
+        is_silent = is_found and self._imu.has_fallen_silent(stamp_ns + self._rig.timeshift_ns)
+        if self._imu_wait_frames < _MAX_IMU_WAIT_FRAMES and not is_silent:
             return None
         return initialisation.state_from_camera(stamp_ns, self._rig, self._bias)
 
