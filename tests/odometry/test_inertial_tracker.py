@@ -12,6 +12,7 @@ from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
 from share.odometry import filter, initialisation
+from share.odometry.health import DivergenceMonitor
 from share.odometry.inertial_tracker import InertialTracker
 from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
@@ -428,14 +429,13 @@ def test_a_recording_whose_clock_begins_at_zero(walk):
     assert tracker.state is not None
 
 
-def test_a_camera_that_sticks_while_the_imu_moves_does_not_stay_blind_for_ever(walk, monkeypatch):
-    """Each blind keyframe would begin the drift anew. Sigmas of this walk are of millimetres."""
-    frames = some(walk[0], lambda f: dataclasses.replace(f, image0=walk[0][15].image0), 16, 45)
-    print([str(s) for s in states(run(walk, frames)[0])])
-    monkeypatch.setattr("share.odometry.health._MAX_DRIFT_M", 0.01)
-    found = states(run(walk, frames)[0])
-    print([str(s) for s in found])
-    assert found.index(BLIND) < found.index(LOST)
+def test_keyframes_tell_the_monitor_their_drift_and_features(walk, monkeypatch):
+    added = []
+    monkeypatch.setattr(DivergenceMonitor, "add_keyframe", lambda self, *arguments: added.append(arguments))
+    results, candidates, tracker = run(walk, walk[0])
+    assert len(added) >= len(candidates) > 1
+    assert all(0 < drift_m < 0.01 and count >= 6 for drift_m, count in added[1:])
+    assert added[0][1] >= 25
 
 
 def test_a_lost_tracker_is_found_by_images_alone_where_the_imu_is_silent(walk):
