@@ -432,7 +432,7 @@ def test_a_recording_whose_clock_begins_at_zero(walk):
 def test_keyframes_tell_the_monitor_their_drift_and_features(walk, monkeypatch):
     added = []
     monkeypatch.setattr(DivergenceMonitor, "add_keyframe", lambda self, *arguments: added.append(arguments))
-    results, candidates, tracker = run(walk, walk[0])
+    _, candidates, _ = run(walk, walk[0])
     assert len(added) >= len(candidates) > 1
     assert all(0 < drift_m < 0.01 and count >= 6 for drift_m, count in added[1:])
     assert added[0][1] >= 25
