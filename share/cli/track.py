@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from share.view.viewer import LiveRoom
 
 _LONG_INIT_S = 1.0  # a first pose later than this is reported
+_UNCERTAIN = {  # states of poses that are less certain
+    "WEAK": "few features",
+    "INERTIAL_ONLY": "IMU alone (no feature accepted)",
+    "VISION_ONLY": "images alone (no IMU)",
+}
 
 
 @click.command()
@@ -196,6 +201,10 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
         f"{report['cpu_ms_per_frame']:.1f} ms CPU per frame, "
         f"plus {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
+    if uncertain := [
+        f"{text} in {n}" for state, text in _UNCERTAIN.items() if (n := report["states"][state])
+    ]:
+        lines.append(f"of the frames with a pose: {', '.join(uncertain)}")
     if report["init_s"] > _LONG_INIT_S:
         lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_wait_text(report)]))
     if report["inconsistent_frames"]:

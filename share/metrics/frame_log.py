@@ -219,6 +219,7 @@ class RunLog:
         return {
             "frames": frames,
             "tracked": int(rows.has_pose.sum()),
+            "states": {str(state): int(rows.in_state(state).sum()) for state in TrackState},
             "keyframes": int(rows.keyframe.sum()),
             "sent": sent,
             "lost_s": rows.lost_s,

@@ -11,14 +11,14 @@ from share.types import F64, TrackState
 
 MIN_OK_FEATURES = 25  # in use; with fewer the state is WEAK
 MIN_POSE_FEATURES = 6  # in use; with fewer it is INERTIAL_ONLY
-_MAX_DRIFT_M = 0.5  # position sigma since the newest keyframe at which the state is LOST
+_MAX_DRIFT_M = 0.5  # position sigma since the newest keyframe with features at which the state is LOST
 _SETTLING_S = 1.0  # after its start, in which a filter converges
 _MIN_DURATION_S = 1.0  # of frames after that, before an inconsistency is reported
 _AVERAGING_S = 5.0  # of the exponential mean
 _MIN_MEASUREMENTS = 25  # features in a frame; with fewer it is ignored
 _MAX_MEDIAN_NIS = 0.8  # 0.05 to 0.6 where the calibration is right
 _MAX_EMPTY_FRAMES = 3  # frames in which almost no feature is found where it should be
-_MAX_REJECTED_S = 1.0  # time in which almost every feature is rejected
+_MAX_REJECTED_S = 1.0  # time in which almost every feature is rejected, less that in which some are not
 _MAX_INTERVAL_S = 0.2  # the most that one frame adds to it
 
 
@@ -56,11 +56,22 @@ class DivergenceMonitor:
     for long none that the filter accepts.
 
     Features that have left the view do not count. A frame with fewer than `MIN_OK_FEATURES` in view says
-    little; fewer than `MIN_POSE_FEATURES` found or accepted count as none.
+    little; fewer than `MIN_POSE_FEATURES` found or accepted count as none. New features agree with a wrong
+    IMU for a frame or two, so a frame in which some are accepted takes off no more than its own time.
+
+    blind_drift_m: position sigma, m, from the newest keyframe with accepted features to the newest of all.
     """
 
     def __init__(self) -> None:
         self._empty_frames, self._rejected_s = 0, 0.0
+        self.blind_drift_m = 0.0
+
+    def add_keyframe(self, drift_m: float, inlier_count: int) -> None:
+        """Add a keyframe at a frame with `inlier_count` accepted features, `drift_m` from the one before.
+
+        Without any the keyframe is known no better than the body. A sum of sigmas bounds that of the sum.
+        """
+        self.blind_drift_m = self.blind_drift_m + drift_m if inlier_count < MIN_POSE_FEATURES else 0.0
 
     def add(
         self, textured: bool, in_view: int, found_count: int, inlier_count: int, interval_s: float
@@ -70,11 +81,14 @@ class DivergenceMonitor:
         textured: the image shows something. `in_view` features should be in view, `found_count` were found,
         `inlier_count` were accepted as well.
         """
-        if textured and in_view >= MIN_OK_FEATURES:
+        if not textured:
+            return
+        if in_view >= MIN_OK_FEATURES:
             self._empty_frames = self._empty_frames + 1 if found_count < MIN_POSE_FEATURES else 0
         if in_view >= MIN_POSE_FEATURES:  # else all were rejected in the frame before, and are gone
-            rejected = textured and inlier_count < MIN_POSE_FEATURES
-            self._rejected_s = self._rejected_s + min(interval_s, _MAX_INTERVAL_S) if rejected else 0.0
+            step_s = min(interval_s, _MAX_INTERVAL_S)
+            is_rejected = inlier_count < MIN_POSE_FEATURES
+            self._rejected_s = max(self._rejected_s + (step_s if is_rejected else -step_s), 0.0)
 
     @property
     def is_suspected(self) -> bool:
@@ -87,10 +101,13 @@ class DivergenceMonitor:
         return self._empty_frames >= _MAX_EMPTY_FRAMES or self._rejected_s > _MAX_REJECTED_S
 
 
-def is_plausible(s: FilterState, max_speed_m_s: float) -> bool:
-    """Return whether the state is finite, not too fast, and its drift since the newest keyframe small."""
+def is_plausible(s: FilterState, max_speed_m_s: float, blind_drift_m: float) -> bool:
+    """Return whether the state is finite, not too fast, and its drift since the newest keyframe with features
+    small. blind_drift_m: from there to the newest keyframe."""
     finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
-    return bool(finite and np.linalg.norm(s.v) < max_speed_m_s and filter.drift_m(s) < _MAX_DRIFT_M)
+    return bool(
+        finite and np.linalg.norm(s.v) < max_speed_m_s and blind_drift_m + filter.drift_m(s) < _MAX_DRIFT_M
+    )
 
 
 def pose_state(count: int, has_imu: bool) -> TrackState:

@@ -165,9 +165,14 @@ class ImuPredictor:
         return self.buffer.between(from_ns, to_ns, _SILENT_NS)
 
     def restart(self, state: FilterState) -> None:
-        """Begin with a new state: its rate is that of the newest sample."""
+        """Begin with a new state: its rate is that of the newest sample, unless the IMU is silent."""
         gyro = self.buffer.samples.gyro
-        self.rate = gyro[-1] - state.bg if len(gyro) else np.zeros(3)
+        is_known = len(gyro) > 0 and not self.has_fallen_silent(state.stamp_ns)
+        self.rate = gyro[-1] - state.bg if is_known else np.zeros(3)
+
+    def has_fallen_silent(self, now_ns: int) -> bool:
+        """Return whether samples came, but none of late."""
+        return len(self.buffer.samples) > 0 and self.buffer.last_ns < now_ns - _SILENT_NS
 
     def predict(self, s: FilterState, to_ns: int, gyro_only: bool) -> ImuStatus:
         """Propagate the state to `to_ns`, IMU time.

@@ -69,6 +69,7 @@ class InertialTracker:
             raise ValueError("the rig has no IMU; use VisualTracker")
         self._rig, self._config = rig, config
         self._bias = initialisation.unknown_bias(config) if bias is None else bias
+        self._has_bias, self.has_dropped_bias = bias is not None, False  # dropped: contradicted at rest
         self._imu = ImuPredictor(rig.imu, config)
         self._rest = RestDetector()
         self._landmarks: LandmarkMap | None = None
@@ -194,7 +195,7 @@ class InertialTracker:
         if T_odom_cam is None and self._awaits_relocalisation(frame.stamp_ns):
             return TrackResult(TrackState.LOST, None)
         waiting_state = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
-        state = self._first_state(frame.stamp_ns)
+        state = self._first_state(frame.stamp_ns, T_odom_cam is not None)
         if state is None:
             return TrackResult(waiting_state, None, waiting_for=WaitReason.IMU)
         if T_odom_cam is not None:
@@ -224,16 +225,20 @@ class InertialTracker:
             return False
         return 0 < stamp_ns - self._lost_ns < relocalisation.NEW_SEGMENT_S * 1e9
 
-    def _first_state(self, stamp_ns: int) -> FilterState | None:
+    def _first_state(self, stamp_ns: int, is_found: bool) -> FilterState | None:
         """Return a state at odom's origin, z up: by the IMU, or after frames without a sample by the camera
-        alone; None while samples may still come."""
+        alone; None while samples may still come. is_found: relocalised, so the map tells what is up."""
         samples = self._imu.buffer.samples
+        if self._has_bias and initialisation.rest_contradicts(self._bias, samples, self._config):
+            self._bias, self._has_bias = initialisation.unknown_bias(self._config), False
+            self.has_dropped_bias = True
         state = initialisation.state_from_imu(stamp_ns, samples, self._rig, self._config, self._bias)
         self._knows_up = state is not None
         if state is not None:
             return state
         self._imu_wait_frames += 1
-        if self._imu_wait_frames < _MAX_IMU_WAIT_FRAMES:
+        is_silent = is_found and self._imu.has_fallen_silent(stamp_ns + self._rig.timeshift_ns)
+        if self._imu_wait_frames < _MAX_IMU_WAIT_FRAMES and not is_silent:
             return None
         return initialisation.state_from_camera(stamp_ns, self._rig, self._bias)
 
@@ -303,7 +308,9 @@ class InertialTracker:
         """Return whether the state is plausible, and the images do not contradict it for long."""
         in_view, found_count = matches.in_view_count(self._rig.cam0), int(matches.is_found.sum())
         self._divergence.add(is_textured, in_view, found_count, count, interval_ns * 1e-9)
-        return not self._divergence.has_diverged and is_plausible(s, self._config.max_speed_m_s)
+        return not self._divergence.has_diverged and is_plausible(
+            s, self._config.max_speed_m_s, self._divergence.blind_drift_m
+        )
 
     def _advance_mono_window(self, frame: Frame, landmarks: LandmarkMap, is_keyframe: bool) -> bool:
         """Return whether a single camera's window gives the scale, and the state has converged. is_keyframe:
@@ -334,6 +341,7 @@ class InertialTracker:
             cov = se3.compose_cov(se3.inverse(s.T_origin) @ s.T, self._start_cov, cov)
         if wants_keyframe or is_first:
             publish = is_first or self._keyframes.may_publish(frame.stamp_ns)
+            self._divergence.add_keyframe(filter.drift_m(s), count)
             self._keyframes.add(frame, landmarks, self._imu.rate, count < MIN_OK_FEATURES, publish)
         is_ready = self._keyframes.is_ready
         return TrackResult(

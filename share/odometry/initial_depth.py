@@ -33,6 +33,7 @@ _NEIGHBOUR_PX = 30.0  # features nearer than this weigh about the same
 _STEREO_PX = 0.25  # noise of a disparity
 _DEPTH_SIGMA_PX, _DEPTH_BASELINE_M = 0.3, 0.05  # px, m: of the stereo pair inside a depth camera
 _MAX_DISPARITY_ERROR_PX = 2.0  # between the epipolar search and its refinement
+_MIN_MEASURED_SHARE = 0.1  # of the new features; with less the second camera is covered, blinded or stuck
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +54,18 @@ def initial_depths(
     frame: Frame, rig: Rig, state: FilterState, px: F32, ray: F64, known_px: F32
 ) -> DepthPrior:
     """Return the inverse depths of new features at px (N, 2) of the frame, on rays (N, 2): measured, or else
-    by the state's features at known_px (M, 2). NaN where a measurement fails."""
+    by the state's features at known_px (M, 2). NaN where a measurement fails, unless nearly all do."""
     if not measures_depth(frame, rig):
         return prior_from_neighbours(state, px, known_px)
+    measured = _measured_depths(frame, rig, px, ray)
+    has_enough = min(len(px), len(state.feature_ids)) >= _MIN_NEIGHBOURS
+    if has_enough and np.isfinite(measured.rho).mean() < _MIN_MEASURED_SHARE:
+        return prior_from_neighbours(state, px, known_px)
+    return measured
+
+
+def _measured_depths(frame: Frame, rig: Rig, px: F32, ray: F64) -> DepthPrior:
+    """Return the inverse depths by stereo or a depth camera; NaN where that fails."""
     focal, n = rig.cam0.focal, len(px)
     if frame.image1 is not None and rig.cam1 is not None:
         z = _stereo_depth(frame.image0, frame.image1, rig, px, ray)

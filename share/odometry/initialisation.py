@@ -27,6 +27,8 @@ from share.odometry.state import (
 from share.types import F64, ImuBatch, WaitReason
 
 MIN_IMU_S = 0.05  # of IMU samples
+_MAX_AGE_S = 0.1  # of the newest sample: an older one says nothing about the state now
+_MIN_FORCE = 1.0  # m/s^2; in free fall, or of a dead accelerometer, a force does not show which way is up
 _AVERAGING_S = 0.5
 _UNKNOWN_TILT_RAD = 1.0
 _GAUGE_SIGMA = 1e-4  # rad, m: of position and heading, which define odom
@@ -45,17 +47,21 @@ _RATE_GATE, _FORCE_GATE = 16.3, 10.8  # chi-square, 3 and 1 degrees of freedom, 
 def state_from_imu(
     stamp_ns: int, imu: ImuBatch, rig: Rig, config: InertialConfig, bias: ImuBias
 ) -> FilterState | None:
-    """Return a state at odom's origin, z up, at the time of the image; None with too few samples.
+    """Return a state at odom's origin, z up, at the time of the image; None with too few samples, with none
+    of late, or while they do not show which way is up.
 
     bias: as known before; it is ignored where samples at rest contradict it.
     """
     if len(imu) < 2 or (imu.stamps_ns[-1] - imu.stamps_ns[0]) < MIN_IMU_S * 1e9:
         return None
-    recent = imu.stamps_ns >= imu.stamps_ns[-1] - round(_AVERAGING_S * 1e9)
-    gyro, accel = imu.gyro[recent], imu.accel[recent]
-    force, rate = accel.mean(axis=0), gyro.mean(axis=0)
-    is_still = _is_still(gyro, accel)
-    if is_still and _contradicts_rest(bias, force, rate, config.gravity):
+    if imu.stamps_ns[-1] < stamp_ns + rig.timeshift_ns - _MAX_AGE_S * 1e9:
+        return None
+    recent = _recent(imu)
+    force, rate = recent.accel.mean(axis=0), recent.gyro.mean(axis=0)
+    if np.linalg.norm(force) < _MIN_FORCE:
+        return None
+    is_still = _is_still(recent.gyro, recent.accel)
+    if rest_contradicts(bias, imu, config):
         bias = unknown_bias(config)
     T = align_to_gravity(force - bias.accel, rig.T_body_cam0[:3, 2])
     state = _state_at_image(stamp_ns, T, rig, bias, _initial_sigmas(is_still, bias))
@@ -92,9 +98,20 @@ def _is_still(gyro: F64, accel: F64) -> bool:
     return bool(rate < _MAX_STILL_RATE and np.linalg.norm(accel.std(axis=0)) < _MAX_STILL_ACCEL_STD)
 
 
-def _contradicts_rest(bias: ImuBias, force: F64, rate: F64, g: float) -> bool:
-    """Return whether the mean force and rate (3,) of a body at rest are inconsistent with the bias:
-    another IMU, or a new calibration."""
+def _recent(imu: ImuBatch) -> ImuBatch:
+    """Return the samples that are averaged, of one or more."""
+    return imu.take(imu.stamps_ns >= imu.stamps_ns[-1] - round(_AVERAGING_S * 1e9))
+
+
+def rest_contradicts(bias: ImuBias, imu: ImuBatch, config: InertialConfig) -> bool:
+    """Return whether the newest of these samples are of a body at rest, and inconsistent with the bias: of
+    another IMU, or before a new calibration."""
+    if not len(imu):
+        return False
+    recent, g = _recent(imu), config.gravity
+    if not _is_still(recent.gyro, recent.accel):
+        return False
+    force, rate = recent.accel.mean(axis=0), recent.gyro.mean(axis=0)
     rate_nis = ((rate - bias.gyro) ** 2).sum() / (bias.gyro_sigma**2 + _STILL_RATE_SIGMA**2)
     force_nis = (np.linalg.norm(force - bias.accel) - g) ** 2 / (bias.accel_sigma**2 + _STILL_FORCE_SIGMA**2)
     return bool(rate_nis > _RATE_GATE or force_nis > _FORCE_GATE)

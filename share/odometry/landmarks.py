@@ -121,7 +121,8 @@ class LandmarkMap:
         rho_scale = ray_z / (ray_z + s.rho * T_cam_anchor[:, 2, 3]) ** 2  # d rho here / d rho in the anchor
         uv = self._rig.cam0.normalise(appearance.last_px.astype(np.float64))
         found = Surfaces(uv, plane, np.sqrt(s.rho_variance) * np.abs(rho_scale))
-        is_known = self._has_known_depth() | measures_depth(frame, self._rig)
+        is_measured = ~self._has_unknown_depth() & measures_depth(frame, self._rig)
+        is_known = self._has_known_depth() | is_measured
         return found.take(is_known & (offset > _MIN_PLANE_OFFSET) & found.is_valid())
 
     def feature_statistics(self) -> FeatureStatistics:

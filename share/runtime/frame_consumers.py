@@ -102,6 +102,8 @@ class LocalTracking(FrameConsumer):
             post(ev.KeyframeMade(tracked, candidate))
         self._tracker.attempt("finishing a keyframe", frame, self._tracker.finish_keyframe)
         self._log.imu_outliers = self._tracker.rejected_imu_samples
+        if self._tracker.has_dropped_bias:
+            self._bias_store.note_dropped()
         self._log.cpu_s += time.thread_time() - cpu_start_s
 
     def predict(self, frame: Frame, arrived_ns: int, post: Post) -> None:

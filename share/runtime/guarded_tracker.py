@@ -93,6 +93,11 @@ class GuardedTracker:
         """Number of IMU samples rejected as outliers, over all trackers."""
         return self._rejected_before + self._tracker.rejected_imu_samples
 
+    @property
+    def has_dropped_bias(self) -> bool:
+        """Whether the initial bias is not used, because a body at rest contradicts it."""
+        return isinstance(self._tracker, InertialTracker) and self._tracker.has_dropped_bias
+
     def _recover(self, frame: Frame) -> None:
         had_pose, self._had_pose = self._had_pose, False
         try:

@@ -130,8 +130,17 @@ class ImuBiasStore:
         except ShareError as error:
             self._notify(f"the IMU bias is not saved: {error}")
 
+    def note_dropped(self) -> None:
+        """The tracker does not use the loaded bias; says so once."""
+        if self._saved_ns is not None:
+            self._saved_ns = None
+            self._notify(
+                "the IMU bias of the last run is not used: the IMU measures another one at rest; it is "
+                "learnt anew"
+            )
+
     def report(self) -> dict[str, Any]:
-        """Return, for a live camera with an IMU, the end of the run that saved the loaded bias, or None."""
+        """Return, for a live camera with an IMU, the end of the run that saved the bias in use, or None."""
         return {} if self._serial is None else {"imu_bias": {"learnt_at": _utc(self._saved_ns)}}
 
     def _load(self, serial: str, source: Source, config: InertialConfig) -> None:

@@ -81,6 +81,8 @@ def track(
     frames = read_frames(source, settings, counters, on_decoded=log.add_decode_time, notify=notify)
     for step in track_frames(frames, tracker):
         stamp_ns, result = step.frame.stamp_ns, step.result
+        if tracker.has_dropped_bias:
+            bias_store.note_dropped()
         waited_ms = queue.wait_ms(stamp_ns)
         queue.finish_frame(stamp_ns, waited_ms + 1e3 * step.total_s)
         log.add_result(result.new_segment, result.is_consistent, result.waiting_for)

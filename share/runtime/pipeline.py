@@ -29,6 +29,7 @@ _MAX_MISFITS = (
     10  # images of a wrong size before any of the right one: the calibration is another recording's
 )
 _SILENT_NS = 1_000_000_000  # without IMU samples before a warning
+_STUCK_NS = 100_000_000  # of repeated samples before a warning
 _MAX_SKIPPED_FRAMES = 600  # consecutive undecodable frames of which IMU samples are kept
 
 _IMU_WARNINGS = {
@@ -51,7 +52,8 @@ def read_frames(
     one, and `on_damaged` is called, or else the source's losses count it.
 
     on_decoded: called with each frame's decoding CPU time on this thread, s. notify: called once per kind of
-    IMU fault, and when a recording's IMU falls silent (a camera's feed reports that itself). Raises
+    IMU fault, also when it only repeats the same values, and when a recording's IMU falls silent (a camera's
+    feed reports that itself). Raises
     CalibrationMismatchError if the first ten images, or all, have another size than the calibration.
     """
     rig = source.rig
@@ -65,10 +67,10 @@ def read_frames(
     )
     bundles = sequence_frames(source.measurements(), merger)
     skipped, unwarned = _SkippedFrames(on_damaged or partial(_count_loss, source)), set(_IMU_WARNINGS)
-    silence_monitor = None if rig.imu is None or source.reports_silence else _ImuSilenceMonitor(notify)
+    silence_monitor = _ImuSilenceMonitor(notify, source.reports_silence) if rig.imu else None
     for bundle in bundles:
         if silence_monitor is not None:
-            silence_monitor.update(bundle)
+            silence_monitor.update(bundle, counters.imu_repeated)
         for name in [name for name in unwarned if getattr(counters, name)]:
             unwarned.remove(name)
             notify(_IMU_WARNINGS[name].format(source.imu_range))
@@ -89,24 +91,36 @@ def _count_loss(source: Source, error: DataError) -> None:
 
 
 class _ImuSilenceMonitor:
-    """Warns once when IMU samples stop."""
+    """Warns once when IMU samples stop, and once when they only repeat the same values."""
 
-    def __init__(self, notify: Callable[[str], None]) -> None:
+    def __init__(self, notify: Callable[[str], None], reports_silence: bool) -> None:
+        """reports_silence: somebody else warns of samples that stop."""
         self._notify = notify
         self._first_ns = self._last_imu_ns = -1  # stamps of the first frame and the last one with samples
-        self._has_warned = False
+        self._repeated_before = 0  # repeated samples until then
+        self._has_warned, self._has_warned_of_repeats = reports_silence, False
 
-    def update(self, bundle: UndecodedFrame) -> None:
+    def update(self, bundle: UndecodedFrame, repeated: int) -> None:
+        """Add a frame. repeated: samples dropped so far because they repeat the ones before."""
         if len(bundle.imu) or bundle.index == 0:
-            self._last_imu_ns = bundle.stamp_ns
+            self._last_imu_ns, self._repeated_before = bundle.stamp_ns, repeated
         if bundle.index == 0:
             self._first_ns = bundle.stamp_ns
-        if not self._has_warned and bundle.stamp_ns - self._last_imu_ns >= _SILENT_NS:
+        silent_ns = bundle.stamp_ns - self._last_imu_ns
+        since_s = (self._last_imu_ns - self._first_ns) * 1e-9
+        meanwhile = "meanwhile poses come from images alone"
+        if repeated > self._repeated_before:
+            if silent_ns >= _STUCK_NS and not self._has_warned_of_repeats:
+                self._has_warned_of_repeats = True
+                self._notify(
+                    f"the IMU repeats the same values from {since_s:.1f} s on; {meanwhile} "
+                    "(sequencer.imu_repeated in the report); check its driver, cable and supply"
+                )
+        elif silent_ns >= _SILENT_NS and not self._has_warned:
             self._has_warned = True
-            since_s = (self._last_imu_ns - self._first_ns) * 1e-9
             self._notify(
-                f"no IMU samples from {since_s:.1f} s on, for at least 1 s; meanwhile poses come from images "
-                "alone (sequencer.imu_silent in the report)"
+                f"no IMU samples from {since_s:.1f} s on, for at least 1 s; {meanwhile} "
+                "(sequencer.imu_silent in the report)"
             )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from share.config import SequencerConfig
 from share.geometry.camera import Rig
 from share.sensors.imu_check import ImuCheck, ImuRange
+from share.sensors.imu_repeats import ImuRepeats
 from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU, LazyImage, Measurement
 from share.sensors.stamps import GAP_FACTOR, MAX_JUMP_NS, StampRepair
 from share.types import ImuBatch
@@ -53,6 +54,7 @@ class SequencerCounters:
     imu_dropped: int = 0  # samples more than MAX_JUMP_S before their frame
     imu_out_of_range: int = 0  # dropped: beyond the sensor's range, or not finite
     imu_spikes: int = 0  # dropped: runs of up to three samples far from their neighbours
+    imu_repeated: int = 0  # dropped: equal to the two samples before, or all zero
     wraps: int = 0
     jumps: int = 0
     strays: int = 0
@@ -178,7 +180,7 @@ class FrameMerger:
         self._partners = [self.buffers[name] for name in (CAM1, DEPTH) if name in streams]
         self._images = self.buffers[CAM0]
         self._imu = self.buffers.get(IMU)
-        self._imu_check = ImuCheck(imu_range)
+        self._imu_check, self._imu_repeats = ImuCheck(imu_range), ImuRepeats()
         self._newest_ns = -(2**62)
         self._last_frame_ns: int | None = None
         self.counters = counters
@@ -306,10 +308,13 @@ class FrameMerger:
         return batch
 
     def _valid_samples(self, samples: list[tuple[int, Any]]) -> ImuBatch:
-        """Return the samples that pass the IMU check."""
+        """Return the samples that are measurements and pass the IMU check."""
         if not samples:
             return ImuBatch.empty()
         stamps, table = np.array([s for s, _ in samples], np.int64), np.array([v for _, v in samples], float)
+        if not (measured := self._imu_repeats.valid_mask(table)).all():
+            self.counters.imu_repeated = self._imu_repeats.count
+            stamps, table = stamps[measured], table[measured]
         valid = self._imu_check.valid_mask(stamps, table)
         self.counters.imu_out_of_range = self._imu_check.out_of_range
         self.counters.imu_spikes = self._imu_check.spikes

@@ -53,6 +53,7 @@ class Rows:
         return {
             "frames": len(rows),
             "tracked": len(poses),
+            "states": {str(state): sum(row[3] is state for row in rows) for state in TrackState},
             "keyframes": sum(row[4] for row in rows),
             "sent": sent,
             "lost_s": lost_ns * 1e-9,

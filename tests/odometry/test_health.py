@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.odometry.health import DivergenceMonitor, ImageImuConsistency
+from share.odometry.health import DivergenceMonitor, ImageImuConsistency, is_plausible
+from share.odometry.state import CORE_SIZE, POSE, add_keyframe, initial_state
 
 FRAME_S = 1 / 30
 MANY = 60  # features
@@ -20,7 +21,8 @@ def test_three_frames_without_expected_features_diverge(monitor: DivergenceMonit
     for _ in range(2):
         monitor.add(True, in_view=MANY, found_count=5, inlier_count=5, interval_s=FRAME_S)
     assert monitor.is_suspected
-    monitor.add(True, in_view=MANY, found_count=6, inlier_count=6, interval_s=FRAME_S)
+    for _ in range(3):
+        monitor.add(True, in_view=MANY, found_count=6, inlier_count=6, interval_s=FRAME_S)
     assert not monitor.is_suspected
     for count in range(3):
         assert monitor.has_diverged == (count == 3)
@@ -48,12 +50,40 @@ def test_frames_without_features_in_view_do_not_reset(monitor: DivergenceMonitor
     assert monitor.has_diverged
 
 
-def test_one_frame_with_inliers_resets(monitor: DivergenceMonitor) -> None:
+def test_a_frame_with_inliers_now_and_then_does_not_reset(monitor: DivergenceMonitor) -> None:
+    """New features agree with a wrong IMU for a frame or two."""
+    diverged = []
     for k in range(90):
-        monitor.add(
-            True, in_view=MANY, found_count=MANY, inlier_count=MANY if k % 20 == 19 else 0, interval_s=FRAME_S
-        )
-    assert not monitor.has_diverged
+        inliers = MANY if k % 20 == 19 else 0
+        monitor.add(True, in_view=MANY, found_count=MANY, inlier_count=inliers, interval_s=FRAME_S)
+        diverged.append(monitor.has_diverged)
+    assert diverged.index(True) == 32  # two frames more than without
+
+
+def test_frames_with_inliers_make_up_for_as_many_without(monitor: DivergenceMonitor) -> None:
+    for k in range(300):
+        inliers = MANY if k % 20 >= 10 else 0
+        monitor.add(True, in_view=MANY, found_count=MANY, inlier_count=inliers, interval_s=FRAME_S)
+        assert not monitor.has_diverged
+
+
+def test_drift_since_the_newest_keyframe_with_features_is_the_sum_since_then(
+    monitor: DivergenceMonitor,
+) -> None:
+    monitor.add_keyframe(0.2, MANY)
+    assert monitor.blind_drift_m == 0.0
+    for _ in range(2):
+        monitor.add_keyframe(0.2, 5)
+    assert monitor.blind_drift_m == pytest.approx(0.4)
+    state = initial_state(
+        0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.eye(4), np.full(CORE_SIZE, 0.09)
+    )
+    add_keyframe(state, 0, np.zeros(3))
+    state.cov[POSE.start + 3, POSE.start + 3] += 0.2**2  # moved since
+    assert is_plausible(state, 8.0, 0.2)
+    assert not is_plausible(state, 8.0, monitor.blind_drift_m)
+    monitor.add_keyframe(0.2, 6)
+    assert is_plausible(state, 8.0, monitor.blind_drift_m)
 
 
 def test_a_gap_adds_at_most_the_longest_interval(monitor: DivergenceMonitor) -> None:

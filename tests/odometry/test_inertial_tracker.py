@@ -12,6 +12,7 @@ from share.geometry.camera import Camera, Rig
 from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
 from share.odometry import filter, initialisation
+from share.odometry.health import DivergenceMonitor
 from share.odometry.inertial_tracker import InertialTracker
 from share.protocol.agent_ledger import KeyframeChain
 from share.recordings.trajectory import Trajectory
@@ -426,3 +427,21 @@ def test_a_recording_whose_clock_begins_at_zero(walk):
     tracker.track(first)
     assert tracker.track(second).state is not TrackState.LOST
     assert tracker.state is not None
+
+
+def test_keyframes_tell_the_monitor_their_drift_and_features(walk, monkeypatch):
+    added = []
+    monkeypatch.setattr(DivergenceMonitor, "add_keyframe", lambda self, *arguments: added.append(arguments))
+    _, candidates, _ = run(walk, walk[0])
+    assert len(added) >= len(candidates) > 1
+    assert all(0 < drift_m < 0.01 and count >= 6 for drift_m, count in added[1:])
+    assert added[0][1] >= 25
+
+
+def test_a_lost_tracker_is_found_by_images_alone_where_the_imu_is_silent(walk):
+    """It does not wait for samples, nor begin with those of a while ago."""
+    frames = some(some(walk[0], mute, 8, 99), dark, 12, 20)
+    results, candidates, _ = run(walk, frames)
+    assert set(states(results)[13:20]) == {LOST}
+    assert set(states(results)[21:26]) == {WITHOUT_IMU}
+    assert not any(c.new_segment for c in candidates[1:])

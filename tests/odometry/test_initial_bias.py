@@ -7,9 +7,10 @@ from helpers.imu_world import GRAVITY, NOISE, rig
 from share.config import InertialConfig
 from share.geometry import se3
 from share.geometry.camera import ImuBias
+from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.initialisation import estimated_bias, state_from_imu, tilt_sigma, unknown_bias
 from share.odometry.state import ACCEL_BIAS, CORE_SIZE, GYRO_BIAS, initial_state
-from share.types import ImuBatch
+from share.types import Frame, ImuBatch
 
 CONFIG = InertialConfig()
 GYRO, ACCEL = np.array([0.006, -0.004, 0.005]), np.array([0.25, -0.2, 0.15])
@@ -96,3 +97,37 @@ def test_an_uncertain_or_implausible_bias_is_not_returned(s):
 
 def test_imu_noise_of_the_test_rig():
     assert NOISE.accel_density / np.sqrt(0.005) == pytest.approx(0.03, rel=0.1)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_a_state_does_not_begin_with_samples_of_a_while_ago(late_s):
+    imu = at_rest()
+    image_ns = int(imu.stamps_ns[-1]) + round(late_s * 1e9)
+    state = state_from_imu(image_ns, imu, rig(), CONFIG, unknown_bias(CONFIG))
+    assert (state is None) == (late_s > 0.1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.filterwarnings("error")
+def test_a_state_does_not_begin_without_a_force(noise):
+    """In free fall, or of an accelerometer that is dead, nothing shows which way is up."""
+    imu = at_rest()
+    weightless = ImuBatch(imu.stamps_ns, imu.gyro, np.random.default_rng(1).normal(0, noise, (len(imu), 3)))
+    assert state_from_imu(int(imu.stamps_ns[-1]), weightless, rig(), CONFIG, unknown_bias(CONFIG)) is None
+
+
+@pytest.mark.parametrize(
+    ("imu", "bias", "dropped"),
+    [
+        (at_rest(), KNOWN, False),
+        (at_rest(accel=ACCEL + 0.5 * Z), KNOWN, True),
+        (at_rest(accel=ACCEL + 0.5 * Z, shake=1.0), KNOWN, False),
+        (at_rest(accel=ACCEL + 3.0 * Z), None, False),
+        (ImuBatch.empty(), KNOWN, False),
+    ],
+    ids=["agrees", "contradicts", "in motion", "none", "silent"],
+)
+def test_the_tracker_tells_that_it_drops_a_contradicted_bias(imu, bias, dropped):
+    tracker, dark = InertialTracker(rig(), CONFIG, bias), np.zeros((480, 640), np.uint8)
+    tracker.track(Frame(500_000_000, 0, dark, dark, imu=imu))
+    assert tracker.has_dropped_bias == dropped

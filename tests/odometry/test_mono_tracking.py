@@ -91,3 +91,16 @@ def test_a_second_camera_that_starts_late(walk):  # noqa: F811
     assert set(states(results)[:8]) == {STARTING}
     assert states(results)[12:] == [OK] * (len(frames) - 12)
     assert error_m(walk, frames, results) < 0.01
+
+
+def blinded(frame):
+    return dataclasses.replace(frame, image1=np.full_like(frame.image1, 255))
+
+
+def test_a_second_camera_that_is_blinded_for_a_while(walk):  # noqa: F811
+    """It still sends images, in which nothing is found."""
+    frames = some(walk[0], blinded, 12, 32)
+    results, _, _ = run(walk, frames)
+    assert states(results)[3:] == [OK] * (len(frames) - 3)
+    assert min(r.inlier_count for r in results[12:]) >= 25
+    assert error_m(walk, frames, results) < 0.015

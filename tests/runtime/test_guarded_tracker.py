@@ -6,6 +6,7 @@ import resource
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from helpers import rig_fuzzer
 from helpers.plain_walk import RIG
+from helpers.recordings import make_euroc
 
 from share.config import Config, InertialConfig
 from share.errors import UsageError
@@ -23,11 +25,13 @@ from share.odometry import filter
 from share.odometry.inertial_tracker import InertialTracker
 from share.odometry.track_result import TrackResult
 from share.protocol import agent_events as ev
-from share.runtime import fault_guard, guarded_tracker
+from share.runtime import fault_guard, guarded_tracker, offline_tracking
 from share.runtime.error_estimators import NoErrorEstimate
 from share.runtime.fault_guard import FaultGuard
 from share.runtime.frame_consumers import LocalTracking
 from share.runtime.guarded_tracker import GuardedTracker
+from share.runtime.imu_bias_store import ImuBiasStore
+from share.runtime.source import open_source
 from share.types import TrackState
 from share.vision import corners
 
@@ -113,6 +117,24 @@ def test_the_bias_outlives_a_replaced_tracker(walk: rig_fuzzer.Walk, monkeypatch
         tracker.finish(frame, True)
         biases.append(tracker.bias)
     assert biases == [None, learnt, learnt]
+
+
+@pytest.mark.parametrize("dropped", [False, True])
+def test_a_bias_that_the_tracker_drops_is_told_to_its_store(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dropped: bool
+) -> None:
+    """By `share track` and by agents."""
+    told: list[bool] = []
+    monkeypatch.setattr(GuardedTracker, "has_dropped_bias", property(lambda self: dropped))
+    monkeypatch.setattr(ImuBiasStore, "note_dropped", lambda self: told.append(True))
+    recording = open_source(str(make_euroc(tmp_path / "recording")))
+    offline_tracking.track(recording, Config(), lambda result: None)
+    assert any(told) == dropped
+    told.clear()
+    guard = FaultGuard(lambda text: None)
+    local = LocalTracking(recording, Config(), guard, NoErrorEstimate(), RunLog(), lambda text: None)
+    local.consume(walk.frames[0], 0, lambda event: None)
+    assert any(told) == dropped
 
 
 def test_a_visual_tracker_has_no_bias(walk: rig_fuzzer.Walk) -> None:

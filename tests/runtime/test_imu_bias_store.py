@@ -51,6 +51,18 @@ def test_a_run_without_an_estimate_keeps_the_saved_bias() -> None:
     assert memory(Camera(), NOON_NS + DAY_NS)[0].report()["imu_bias"]["learnt_at"] == "2026-09-21T14:13:20Z"
 
 
+def test_a_bias_that_a_body_at_rest_contradicts_costs_one_line_and_is_not_reported() -> None:
+    memory(Camera())[0].save(LEARNT)
+    run, said = memory(Camera(), NOON_NS + DAY_NS)
+    for _ in range(3):
+        run.note_dropped()
+    assert [line.startswith("the IMU bias of the last run is not used: ") for line in said] == [True]
+    assert run.report() == {"imu_bias": {"learnt_at": None}}
+    unknown, nothing = memory(Camera("0456"))
+    unknown.note_dropped()
+    assert nothing == []
+
+
 def test_an_old_bias_is_not_used() -> None:
     memory(Camera())[0].save(LEARNT)
     old, said = memory(Camera(), NOON_NS + 365 * DAY_NS)

@@ -26,7 +26,12 @@ def images(stream: str, stamps) -> list[Measurement]:
 
 
 def imu(stamps) -> list[Measurement]:
-    return [Measurement("imu", int(s), (float(s % 1000), 0.0, 0.0, 0.0, 0.0, 9.81)) for s in stamps]
+    """Of a living IMU: no two samples are equal."""
+    noise = [int(s) // 1000 * 7919 % 10007 * 1e-6 for s in stamps]
+    return [
+        Measurement("imu", int(s), (float(s % 1000), 0.0, 0.0, n, 0.0, 9.81))
+        for s, n in zip(stamps, noise, strict=True)
+    ]
 
 
 def recording(frames: int, start: int = 0, skew: int = 0, before: int = 0) -> list[Measurement]:
