@@ -30,25 +30,11 @@ class MeasuredDelay:
 
     ms: tuple[float, ...]
 
-    @property
-    def p50(self) -> float:
-        return float(np.median(self.ms))
-
     def draw_ns(self, normal: float) -> int:
         """Return a delay, ns, for `normal`, a draw from the standard normal distribution."""
         below = 0.5 * (1 + math.erf(normal / math.sqrt(2)))
         return round(float(np.interp(below * (len(self.ms) - 1), range(len(self.ms)), self.ms)) * MS_NS)
 
-
-# CPU time from a frame to its pose, ms, on the reference machine: 1,297 frames of four recorded motions (two
-# of a drone at 752x480, two of a walker at 640x480), measured beside the yardstick and scaled by it.
-_FRAME = MeasuredDelay(
-    (
-        *(2.4, 2.9, 3.0, 3.1, 3.2, 3.3, 3.4, 3.5, 3.6, 3.8, 3.9, 4.0, 4.1, 4.2, 4.2, 4.3, 4.4, 4.4, 4.5, 4.6),
-        *(4.6, 4.7, 4.7, 4.8, 4.9, 4.9, 5.0, 5.1, 5.2, 5.2, 5.3, 5.4, 5.5, 5.6, 5.7, 5.8, 5.9, 6.1, 6.4, 6.9),
-        9.6,
-    )
-)
 
 # Keyframe work after a frame, ms; none after half of the frames. Measured on 1,301 frames of four recordings.
 _SLICES = MeasuredDelay((*[0.0] * 11, 0.45, 2.2, 2.7, 3.5, 4.0, 4.7, 5.3, 5.6, 5.9, 8.2))
@@ -65,7 +51,7 @@ class ProcessingDelays:
     random views of 800 features, with their insertion.
     """
 
-    frame: Delay | MeasuredDelay = _FRAME
+    frame: Delay = Delay(4.3, 5.4)
     keyframe: Delay = Delay(3.9, 4.7)
     finish_keyframe: Delay | MeasuredDelay = _SLICES
     receive: Delay = Delay(0.3, 1.0)
