@@ -8,7 +8,6 @@ child: looks for machines -> pipe -> ClusterProcess: the head answers
 from __future__ import annotations
 
 import contextlib
-import itertools
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -36,8 +35,7 @@ class _Cluster:
     def __init__(self, on_answer: Callable[[], None]) -> None:
         self._on_answer = on_answer
         self._cluster: RayCluster | None = None
-        self._workers: dict[int, RayWorker] = {}
-        self._numbers = itertools.count()
+        self._workers: dict[int, RayWorker] = {}  # by room
 
     def join(self, address: str) -> None:
         """Join. Raises UsageError, ShareError."""
@@ -46,9 +44,9 @@ class _Cluster:
     def start_worker(self) -> tuple[int, str]:
         """Begin a room: its number and its machine. Raises ShareError."""
         assert self._cluster is not None
-        worker, number = self._cluster.start_worker(), next(self._numbers)
-        self._workers[number] = worker
-        return number, worker.machine
+        worker = self._cluster.start_worker()
+        self._workers[worker.room] = worker
+        return worker.room, worker.machine
 
     def exchange(self, number: int, request: bytes, timeout_s: float | None) -> bytes:
         """Return a room's answer to a request. Raises WorkerLostError."""

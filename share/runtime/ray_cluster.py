@@ -45,11 +45,11 @@ class _Machine:
 
 
 class RayWorker:
-    """One room of a `RoomHost`, which is an actor."""
+    """One room of a `RoomHost`, which is an actor. room: its number, of all in the cluster."""
 
     def __init__(self, ray: Any, cluster: RayCluster, machine: _Machine, host: Any, room: int) -> None:
         self._ray, self._cluster, self._machine = ray, cluster, machine
-        self._host, self._room = host, room
+        self._host, self.room = host, room
         self._ending = threading.Lock()
         self._is_ended = False
 
@@ -67,7 +67,7 @@ class RayWorker:
             raise WorkerLostError("has ended the room")
         errors = self._ray.exceptions
         try:
-            answer: bytes = self._ray.get(self._host.call.remote(self._room, request), timeout=timeout_s)
+            answer: bytes = self._ray.get(self._host.call.remote(self.room, request), timeout=timeout_s)
         except errors.GetTimeoutError:
             raise WorkerLostError(f"has not answered for {timeout_s:g} s") from None
         except errors.RayError as error:
@@ -84,7 +84,7 @@ class RayWorker:
         if not was_ended:
             self._cluster.release(self._machine)
             with contextlib.suppress(Exception):  # the machine is gone, or the cluster is
-                self._host.drop.remote(self._room)
+                self._host.drop.remote(self.room)
 
 
 class RayCluster:
