@@ -10,10 +10,8 @@ host -> TrackingEdge -> a process per agent (share.runtime.tracker_processes) ->
 from __future__ import annotations
 
 import queue
-import secrets
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from share.config import Config
@@ -24,64 +22,33 @@ from share.protocol.common_events import Tick
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import (
     AddKeyframe,
-    AddRun,
     ChangesSaved,
-    DropRun,
     EdgeEffect,
     EdgeEvent,
     MapperResult,
-    SaveChanges,
     SendToPeer,
-    SetCredential,
-    SetPresence,
-    StartTracker,
-    StopTracker,
     TrackerAnswered,
     TrackerLost,
     TrackerReady,
-    TrackFrame,
     WriteEvent,
 )
 from share.protocol.edge_records import SessionTotals
-from share.protocol.peer import RestoredRun
-from share.protocol.remote_tracking import TrackingEdge
 from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver
-from share.runtime.keyframe_handover import KeyframeHandover, KeyframesAdded
-from share.runtime.map_writer import CLOSE_S, MapWriter
+from share.runtime.keyframe_handover import KeyframesAdded
+from share.runtime.map_writer import CLOSE_S
 from share.runtime.mapper_process import (
     MapperReport,
     MapRestored,
     PlaceNewsBatch,
     RestoreBegun,
-    RestoreMap,
     SolverDied,
-    StartMapper,
     start_mapper_process,
 )
-from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperProgress, MapperRestarts, RecentTroubles
+from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperRestarts, RecentTroubles
 from share.runtime.room_host import OtherRooms, RoomHost
-from share.runtime.room_parts import MapperLink, RoomStore, StartMapping
-from share.runtime.tracker_processes import TrackerProcesses, tracker_capacity
-from share.scheduling.policies import POLICIES
-
-# without one of these, mapper and file would lack what later ones build on
-_SESSION_EFFECTS = AddKeyframe, AddRun, SetCredential, SetPresence, DropRun, SaveChanges
-_DRAIN_S = 0.5  # wait for the map writer of a session that is over
-
-
-@dataclass(frozen=True)
-class _MapNotice:
-    """A line about the map file for the event log, from another thread."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class _MapperDied:
-    """The mapper's process has died."""
-
-    reason: str
+from share.runtime.room_parts import RoomStore, StartMapping
+from share.runtime.room_session import SESSION_EFFECTS, MapNotice, MapperDied, RoomSession, SessionParts
 
 
 class ServedRoom:
@@ -104,7 +71,7 @@ class ServedRoom:
         totals: SessionTotals | None = None,
         start_mapper: StartMapping = start_mapper_process,
     ) -> None:
-        self._settings, self._host, self._start_ns = settings, host, start_ns
+        self._host = host
         self._observer, self._blinding, self._others = observer, blinding, others
         self._restarts = MapperRestarts(store, settings.merge.enter_m, self._log_map, has_keys)
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
@@ -112,12 +79,13 @@ class ServedRoom:
         self._stopping = False
         self._troubles = RecentTroubles()
         self._other_troubles = RecentTroubles()  # of one agent or map, not of the edge
-        self._start_mapper = start_mapper
         self._totals = totals or SessionTotals()
-        self._start_session(self._load_stored_map())
+        self._parts = SessionParts(settings, start_ns, self._post, start_mapper, others is not None)
+        self._session: RoomSession
+        self._start_session()
 
     def handle(self, event: EdgeEvent) -> None:
-        self.execute(self._state_machine.handle(event, time.monotonic_ns()))
+        self.execute(self._session.state_machine.handle(event, time.monotonic_ns()))
 
     def step(self) -> None:
         """Handle the answers of the room's processes and threads, and the time that has passed."""
@@ -143,10 +111,7 @@ class ServedRoom:
     def end_processes(self) -> None:
         """End all processes after they have answered all messages."""
         self._stopping = True
-        if self._mapper_process is not None:
-            self._handover.flush()
-            self._mapper_process.close()
-        self._trackers.close()
+        self._session.end_processes()
 
     def handle_answers(self) -> None:
         """Handle the answers of the room's processes and threads."""
@@ -155,8 +120,8 @@ class ServedRoom:
 
     def close_file(self, timeout_s: float = CLOSE_S) -> str | None:
         """Close the map file; see `MapWriter.close`. Return why it is incomplete, None if it is complete."""
-        if self._map_writer is not None:
-            return self._map_writer.close(timeout_s)
+        if self._session.map_writer is not None:
+            return self._session.map_writer.close(timeout_s)
         if self.is_waiting and self._restarts.store is not None:  # no session could begin: unlock it
             self._restarts.store.close()
         return None
@@ -173,14 +138,14 @@ class ServedRoom:
     @property
     def protocol(self) -> EdgeProtocol:
         """The state machine of the present session; `execute` carries out what it returns."""
-        return self._state_machine
+        return self._session.state_machine
 
     @property
     def is_idle(self) -> bool:
         """Whether nobody takes part, all is in the map file, and the mapper has nothing to do."""
-        is_saved = self._map_writer is not None and not self._map_writer.pending_changes
-        has_no_work = self._progress.is_idle and not self._restarts.is_restoring
-        return self._state_machine.is_empty and is_saved and has_no_work and not self.is_waiting
+        session = self._session
+        has_no_work = session.progress.is_idle and not self._restarts.is_restoring
+        return session.state_machine.is_empty and session.is_saved and has_no_work and not self.is_waiting
 
     @property
     def is_waiting(self) -> bool:
@@ -195,19 +160,18 @@ class ServedRoom:
 
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe of another room's agent in the map."""
-        if self._mapper_process is not None:
-            self._mapper_process.send(request)
+        self._session.find(request)
 
     def may_have_map(self, map_id: str) -> bool:
         """Return whether there may be a map of this name, by the mapper's newest report, if there is one."""
-        report = self._progress.report
+        report = self._session.progress.report
         return not report or map_id in report.get("maps", {}) or report.get("unlisted_maps", 0) > 0
 
     # ------------------------------------------------------------------ what is shown
 
     def show_poses(self) -> None:
         """Show the observer the newest pose of each present run."""
-        self._observer.add_poses(self._state_machine.latest_poses())
+        self._observer.add_poses(self.protocol.latest_poses())
 
     def show_report(self, report: Mapping[str, Any]) -> None:
         """Show the observer edge.json as it is now."""
@@ -215,94 +179,42 @@ class ServedRoom:
 
     def series(self) -> Mapping[str, Mapping[str, Any]]:
         """Return `series` of edge.json."""
-        return self._blinding.covered_series(self._state_machine.series())
+        return self._blinding.covered_series(self.protocol.series())
 
     def report(self) -> dict[str, Any]:
         """Return edge.json without `series` and what only the edge around the room knows."""
-        report = self._blinding.covered(self._raw_report())
-        map_trouble = None if self._map_writer is None else self._map_writer.trouble
+        report = self._blinding.covered(self._report_of(self._session))
+        progress, map_trouble = self._session.progress, self._session.map_trouble
         return {
             **report,
             "refused": [*self._other_troubles.current(), *report["refused"]],
-            "trouble": [*self._troubles.current(), *filter(None, (map_trouble, self._progress.stall()))],
+            "trouble": [*self._troubles.current(), *filter(None, (map_trouble, progress.stall()))],
             "degraded": self._restarts.losses,
             "agent_trouble": trouble_lines(report["agents"]),
-            **self._progress.last_solve(),
+            **progress.last_solve(),
             **self._restarts.loading(),
         }
 
     def end_totals(self) -> SessionTotals:
         """Return the totals with those of the present session, at its end."""
-        self._totals.add_session(self._raw_report())
+        self._totals.add_session(self._report_of(self._session))
         return self._totals
 
-    def _raw_report(self) -> dict[str, Any]:
-        return self._totals.with_totals(self._state_machine.report(self._progress.report))
+    def _report_of(self, session: RoomSession) -> dict[str, Any]:
+        return self._totals.with_totals(session.state_machine.report(session.progress.report))
 
     # ------------------------------------------------------------------ sessions
 
-    def _load_stored_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
-        """Return the map and the agents' runs to start with. Raises StoreError if the map file is
-        unreadable."""
-        if POLICIES[self._settings.edge.policy].streams_frames:
-            return None, []
-        return self._restarts.load_map()
-
-    def _start_session(
-        self, loaded: tuple[RestoreMap | None, list[RestoredRun]], start_delay_s: float = 0.0
-    ) -> None:
-        """Start a new session: agents see its new number and resend what the map lacks.
-
-        start_delay_s: delay of the mapper's start.
-        """
-        self._progress = MapperProgress(start_delay_s)
-        self._mapper_process: MapperLink | None = None
-        self._map_writer: MapWriter | None = None
-        self._trackers = TrackerProcesses(self._settings, self._post)
-        self._handover: KeyframeHandover  # where there is a mapper
-        self._state_machine: EdgeProtocol
-        if POLICIES[self._settings.edge.policy].streams_frames:
-            self._state_machine = TrackingEdge(
-                self._settings, secrets.randbits(63), began_ns=self._start_ns, capacity=tracker_capacity()
-            )
-        else:
-            self._start_mapping(*loaded, start_delay_s)
-        self._host.expect_growth(loaded[0] is not None)  # until the mapper has it
-        store = self._restarts.store
-        self._observer.begin_session(None if store is None else store.path, loaded[1])
-
-    def _start_mapping(
-        self, restore: RestoreMap | None, known: list[RestoredRun], start_delay_s: float
-    ) -> None:
-        store, writable = self._restarts.store, self._restarts.writable
-        self._state_machine = EdgeProtocol(
-            self._settings,
-            secrets.randbits(63),
-            writable,
-            known,
-            self._start_ns,
-            self._restarts.objects or (),
-            forgotten=self._restarts.forgotten,
-        )
+    def _start_session(self, start_delay_s: float = 0.0) -> None:
+        """Start a session with the map of the file. start_delay_s: delay of the mapper's start. Raises
+        StoreError if the file is unreadable, and what keeps a process or a thread from starting."""
+        restore, known = (None, []) if self._parts.streams_frames else self._restarts.load_map()
+        self._session = RoomSession(self._parts, self._restarts, restore, known, start_delay_s)
         if self._others is not None:
             self._others.note_session()
-        if store is not None and writable:
-            self._map_writer = MapWriter(store, self._post, self._post_map_notice)
-        try:
-            self._begin_mapper(restore, start_delay_s)
-        except BaseException:
-            if self._map_writer is not None:
-                self._map_writer.drain(_DRAIN_S)
-            raise
-
-    def _begin_mapper(self, restore: RestoreMap | None, start_delay_s: float) -> None:
-        store, has_others = self._restarts.store, self._others is not None
-        map_file = None if store is None else store.path
-        self._mapper_process = self._start_mapper(self._post, self._post_mapper_died, start_delay_s)
-        self._mapper_process.send(StartMapper(self._settings, map_file, has_others))
-        if restore is not None:
-            self._mapper_process.send(restore)
-        self._handover = KeyframeHandover(self._mapper_process.send)
+        self._host.expect_growth(restore is not None)  # until the mapper has it
+        store = self._restarts.store
+        self._observer.begin_session(None if store is None else store.path, known)
 
     def _restart_mapping(self, reason: str) -> None:
         """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
@@ -317,23 +229,21 @@ class ServedRoom:
         applied or acknowledged. start_delay_s: of the mapper."""
         self._restart_due_s = time.monotonic() + retry_s  # whatever fails
         try:
-            if self._mapper_process is not None:
-                self._mapper_process.close()
-            if self._map_writer is not None and not self._map_writer.drain(_DRAIN_S):
+            ended = self._session
+            if not ended.end():
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
-            self._restarts.objects = self._state_machine.room.kept_objects()
-            self._restarts.forgotten = self._state_machine.forgotten_next_keyframes()
-            loaded = self._load_stored_map()
-            self._try_to_end_totals()
-            self._start_session(loaded, start_delay_s)
+            self._restarts.objects = ended.state_machine.room.kept_objects()
+            self._restarts.forgotten = ended.state_machine.forgotten_next_keyframes()
+            self._start_session(start_delay_s)
             self._restart_due_s = None
+            self._add_totals(ended)
         except Exception as error:  # the disk; too many open files, or threads
             self._log_map(f"{brief_reason(error)}; retried in {retry_s:g} s")
 
-    def _try_to_end_totals(self) -> None:
+    def _add_totals(self, ended: RoomSession) -> None:
         try:
-            self.end_totals()
+            self._totals.add_session(self._report_of(ended))
         except Exception as error:  # they are for people
             self._host.log_event("internal error", f"totals of a session: {describe_exception(error)}")
 
@@ -351,14 +261,14 @@ class ServedRoom:
                 self._other_troubles.add(text)
                 self.handle(tracker)
             case KeyframesAdded() as added:
-                self._handover.record_added(added)
+                self._session.record_added(added)
             case MapperReport() as report:
-                self._progress.record(report)
+                self._session.progress.record(report)
             case PlaceNewsBatch() as batch if self._others is not None:
                 self._others.note_places(batch.news)
             case KeyframeSought() as sought if self._others is not None:
                 self._others.note_sought(sought)
-            case _MapNotice() as notice:
+            case MapNotice() as notice:
                 self._log_map(notice.text)
             case RestoreBegun():
                 self._restarts.record_begun()
@@ -368,14 +278,14 @@ class ServedRoom:
             case SolverDied() as solver:
                 self._host.log_event("solver died", solver.text)
                 self._troubles.add(f"the solver: {solver.text}")
-            case _MapperDied() as mapper if not self._stopping and self.loss is None:
+            case MapperDied() as mapper if not self._stopping and self.loss is None:
                 self._restart_mapping(f"its process {mapper.reason}")
 
     def _discard_answers(self) -> None:
         """Drop answers to a session that is over; log only its notices."""
         while not self._inbox.empty():
             match self._inbox.get():
-                case _MapNotice() as notice:
+                case MapNotice() as notice:
                     self._log_map(notice.text)
 
     def execute(self, effects: Sequence[EdgeEffect]) -> None:
@@ -388,7 +298,7 @@ class ServedRoom:
             try:
                 self._execute(effect)
             except Exception as error:
-                if isinstance(effect, _SESSION_EFFECTS):
+                if isinstance(effect, SESSION_EFFECTS):
                     self._restart_mapping(f"it lacks a change ({describe_exception(error)})")
                     return
                 errors.append(error)
@@ -410,20 +320,15 @@ class ServedRoom:
         match effect:
             case SendToPeer():
                 self._host.send(effect.peer_id, effect.frames)
-            case AddKeyframe() if self._mapper_process is not None:
-                self._handover.add(effect)
-                if self._others is not None:
-                    self._others.note_keyframe(effect)
-            case AddRun() | SetCredential() | SetPresence() | DropRun() if self._mapper_process is not None:
-                self._mapper_process.send(effect)
-            case StartTracker() | TrackFrame() | StopTracker():
-                self._trackers.execute(effect)
-            case SaveChanges() if self._map_writer is not None:
-                self._map_writer.submit(effect)
             case WriteEvent():
                 self._host.record(effect.fields)
                 if effect.fields["event"] == "step failed" and effect.fields["agent"] is None:
                     self._other_troubles.add(effect.fields["reason"])
+            case AddKeyframe() if self._others is not None:
+                self._session.execute(effect)
+                self._others.note_keyframe(effect)
+            case _:
+                self._session.execute(effect)
 
     def _log_map(self, reason: str) -> None:
         self._host.log_event("map", reason)
@@ -433,9 +338,3 @@ class ServedRoom:
     def _post(self, message: object) -> None:
         self._inbox.put(message)
         self._host.wake()
-
-    def _post_map_notice(self, text: str) -> None:
-        self._post(_MapNotice(text))
-
-    def _post_mapper_died(self, reason: str) -> None:
-        self._post(_MapperDied(reason))

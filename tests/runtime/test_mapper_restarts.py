@@ -31,7 +31,7 @@ from share.protocol.edge_events import (
     TrackerLost,
 )
 from share.runtime import edge as edge_module
-from share.runtime import mapper_process, mapper_supervision, served_room
+from share.runtime import mapper_process, mapper_supervision, room_session
 from share.runtime.blinding import NoBlinding
 from share.runtime.edge import EdgeRun
 from share.runtime.edge_observer import EdgeObservers
@@ -191,7 +191,7 @@ def test_answers_to_an_earlier_session_are_discarded(edge, monkeypatch):
             self._answer(ChangesSaved(10**6))
             return super().drain(timeout_s)
 
-    monkeypatch.setattr(served_room, "MapWriter", Writer)
+    monkeypatch.setattr(room_session, "MapWriter", Writer)
     monkeypatch.setattr(
         EdgeProtocol, "handle", lambda self, event, now: handled.append(event) or handle(self, event, now)
     )
@@ -506,7 +506,7 @@ def test_a_restart_that_fails_is_tried_again_after_a_pause(path, quick, monkeypa
 def test_a_room_that_waits_for_its_map_unlocks_the_file_at_the_end(path, quick, monkeypatch):
     started: list = []
     room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
-    monkeypatch.setattr(served_room, "MapWriter", lambda *_: {}["none"])
+    monkeypatch.setattr(room_session, "MapWriter", lambda *_: {}["none"])
     started[0]("was ended by SIGKILL")
     room.step()
     assert room.is_waiting
@@ -526,7 +526,7 @@ def test_a_session_goes_on_without_what_nobody_needs_only(path, quick):
         room.execute([SendToPeer(b"ann", ()), SendToPeer(b"bob", (b"1",)), save])
     assert sent == [(b"1",)]
     assert room.report()["session"] == before
-    room._map_writer.submit = lambda request: {}["none"]
+    room._session.map_writer.submit = lambda request: {}["none"]
     room.execute([save, SendToPeer(b"ann", (b"2",))])
     assert sent == [(b"1",)]  # such as an acknowledgement of what is not in the file
     assert room.report()["session"] != before
@@ -577,13 +577,13 @@ def test_counters_continue_after_a_mapper_died(edge):
 
 def test_a_dead_tracker_is_trouble_of_its_agent(monkeypatch):
     """Not the edge's: else an agent could make /health 503 by its frames."""
-    made = served_room.TrackerProcesses
+    made = room_session.TrackerProcesses
 
     def with_a_dead_one(settings, on_answer):
         on_answer(TrackerLost("ann-0001", 0, "was ended by SIGKILL"))
         return made(settings, on_answer)
 
-    monkeypatch.setattr(served_room, "TrackerProcesses", with_a_dead_one)
+    monkeypatch.setattr(room_session, "TrackerProcesses", with_a_dead_one)
     run = EdgeRun(Config(edge=EdgeConfig(policy="streamed")), Link(), None, lambda fields: None)
     thread = threading.Thread(target=run.run)
     thread.start()
