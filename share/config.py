@@ -191,7 +191,7 @@ class ControlConfig:
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
     rate_min_hz: float = 1.5  # lowest rate by QoE; only where the air is short are there lower ones
     rate_max_hz: float = 5.0  # highest rate of an agent, and the initial one by QoE
-    fixed_rate_hz: float = 1.5  # rate of every agent by policy fixed
+    fixed_rate_hz: float = 1.5  # rate of every agent by policy fixed; at most `rate_max_hz`
     fixed_jpeg_quality: int | None = None  # of pictures by policy fixed; null: 50
     random_seed: int = 1  # of the merge gate and of policy random
     far_m: float = 5.0  # far plane of the view frusta; the near one is at 0.3 m
@@ -201,6 +201,11 @@ class ControlConfig:
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
         _require_positive(self, "fixed_rate_hz")
+        if self.fixed_rate_hz > max(self.rate_max_hz, ControlConfig.fixed_rate_hz):
+            raise ValueError(
+                f"fixed_rate_hz: {self.fixed_rate_hz:g} Hz is above rate_max_hz, {self.rate_max_hz:g} Hz; "
+                "raise that too"
+            )
         if self.fixed_jpeg_quality is not None and not 1 <= self.fixed_jpeg_quality <= 100:
             raise ValueError(f"fixed_jpeg_quality: {self.fixed_jpeg_quality} is outside 1 .. 100")
         if not self.far_m > NEAR_M:

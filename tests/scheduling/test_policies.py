@@ -224,8 +224,10 @@ def test_fixed_is_one_rate_for_all_from_the_first_keyframe_on() -> None:
             assert fixed.evaluate("ann", report(kind, 1.0, told)) == RateGrant(0.7)
     small = made("fixed", replace(CONFIG, fixed_rate_hz=0.7, fixed_jpeg_quality=20))
     assert small.first_grant("ann", AgentKind.AR, 0) == RateGrant(0.7, None, 20)
-    capped = made("fixed", replace(CONFIG, fixed_rate_hz=99.0))
-    assert capped.first_grant("ann", AgentKind.AR, 0) == RateGrant(CONFIG.rate_max_hz)
+    capped = made("fixed", replace(CONFIG, rate_min_hz=1.0, rate_max_hz=1.2))
+    assert capped.first_grant("ann", AgentKind.AR, 0) == RateGrant(1.2)
+    with pytest.raises(ValueError, match="fixed_rate_hz: 50 Hz is above rate_max_hz, 10 Hz; raise that too"):
+        replace(CONFIG, fixed_rate_hz=50.0)
 
 
 def test_share_begins_slowly_and_yields_where_keyframes_take_long() -> None:

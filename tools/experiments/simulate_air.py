@@ -53,7 +53,7 @@ from measure_joins import configured  # noqa: E402
 from modelled_mapper import ModelledMapper, RecognitionModel  # noqa: E402
 from modelled_room import SIMULATED, frames_of_all, shared_errors, truth_of, which  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
-from tool_main import exit_code  # noqa: E402
+from tool_main import count, exit_code, positive, seed_range, time_range  # noqa: E402
 
 from share.config import NEAR_M, Config, ControlConfig, with_policy  # noqa: E402
 from share.errors import UsageError  # noqa: E402
@@ -142,13 +142,13 @@ def _waiting_ms(agent: AgentProtocol, now_ns: int) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--agents", type=int, default=12)
+    parser.add_argument("--agents", type=count, default=12)
     parser.add_argument("--air", nargs="+", default=["shared-5", "shared-8"])
-    parser.add_argument("--seeds", default="401:403", metavar="FIRST:END")
+    parser.add_argument("--seeds", type=seed_range, default="401:403", metavar="FIRST:END")
     parser.add_argument("--policies", nargs="+", default=["share", "covins-g", "fixed@1.5"])
-    parser.add_argument("--halved", metavar="A:B")
-    parser.add_argument("--late", type=float, metavar="S")
-    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--halved", type=time_range, metavar="A:B")
+    parser.add_argument("--late", type=positive, metavar="S")
+    parser.add_argument("--seconds", type=positive, default=60.0)
     parser.add_argument("--sigma", action="store_true")
     parser.add_argument("--alone", action="store_true")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
@@ -159,11 +159,12 @@ def main() -> int:
 
 def simulate(options: argparse.Namespace) -> None:
     """Run every policy on every air, seed by seed."""
-    first, end = map(int, options.seeds.split(":"))
     configs = {policy: settings_of(policy, options.set) for policy in options.policies}
     terms = options.halved, options.late, options.sigma, options.alone
+    for air in options.air:
+        load_network(air)  # an unknown one is refused before rooms are made
     rows: list[Row] = []
-    for seed in range(first, end):
+    for seed in options.seeds:
         made = scarce_room(options.agents, seed, options.seconds)
         for air in options.air:
             for policy, config in configs.items():
@@ -250,7 +251,7 @@ def play(
     config: Config,
     air: str,
     seed: int,
-    halved: str | None = None,
+    halved: tuple[float, float] | None = None,
     late_s: float | None = None,
     by_sigma: bool = False,
     is_alone: bool = False,
@@ -263,7 +264,7 @@ def play(
     if constant is not None:
         world.edge._rate_scheduler.policy = ConstantRates(config.control, constant)
     if halved is not None:
-        _halve(world, *map(float, halved.split(":")))
+        _halve(world, *halved)
     if late_s is not None:
         world.arrivals_s = dict.fromkeys(list(made.agents)[len(who) // 2 :], late_s)
     world.run(seconds)

@@ -29,7 +29,7 @@ from keyframe_making import make_unseen  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet, Spacing  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from modelled_room import SIMULATED, Row, mean, play  # noqa: E402
-from tool_main import exit_code, line  # noqa: E402
+from tool_main import exit_code, line, seed_range  # noqa: E402
 
 from share.config import with_policy  # noqa: E402
 from share.errors import UsageError  # noqa: E402
@@ -50,7 +50,7 @@ def main() -> int:
     parser.add_argument("--rooms-of", nargs="*", default=["10x5"], metavar="ROOMSxAGENTS")
     parser.add_argument("--policies", nargs="+", choices=SIMULATED, default=["covins-g", "share"])
     parser.add_argument("--link", default="wifi5")
-    parser.add_argument("--seeds", default="401:403", metavar="FIRST:END")
+    parser.add_argument("--seeds", type=seed_range, default="401:403", metavar="FIRST:END")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path)
@@ -60,8 +60,7 @@ def main() -> int:
 
 def simulate(options: argparse.Namespace) -> None:
     """Run every size by every policy, seed by seed."""
-    first, end = map(int, options.seeds.split(":"))
-    seeds, sizes = range(first, end), [(1, n) for n in options.agents] + list(map(_size, options.rooms_of))
+    seeds, sizes = options.seeds, [(1, n) for n in options.agents] + list(map(_size, options.rooms_of))
     jobs: list[Job] = [
         (size, seed, tuple(options.policies), options.link, tuple(options.set))
         for size in sizes

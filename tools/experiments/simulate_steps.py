@@ -27,7 +27,7 @@ import numpy as np  # noqa: E402
 from scarce_room import scarce_room  # noqa: E402
 from simulate_air import SampledSimulation, begin, settings_of  # noqa: E402
 from step_response import StepResponse, step_response  # noqa: E402
-from tool_main import exit_code, line  # noqa: E402
+from tool_main import count, exit_code, line, seed_range  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.lab.evaluate.charts import draw_lines  # noqa: E402
@@ -70,9 +70,9 @@ class SteppedSimulation(SampledSimulation):
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--agents", type=int, default=12)
+    parser.add_argument("--agents", type=count, default=12)
     parser.add_argument("--air", nargs="+", default=["shared-8", "shared-15"])
-    parser.add_argument("--seeds", default="601:602", metavar="FIRST:END")
+    parser.add_argument("--seeds", type=seed_range, default="601:602", metavar="FIRST:END")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
     parser.add_argument("--policy", default="share")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")
@@ -83,7 +83,7 @@ def main() -> int:
 
 def simulate(options: argparse.Namespace) -> None:
     """Run every step on every air, and print how rates and delays answer."""
-    config, seeds = settings_of(options.policy, options.set), range(*map(int, options.seeds.split(":")))
+    config, seeds = settings_of(options.policy, options.set), options.seeds
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
     for air in options.air:
         for step in options.steps:
