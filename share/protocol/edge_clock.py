@@ -57,7 +57,7 @@ NOISE_US = 20.0  # standard deviation of an exchange that was not queued
 ASYMMETRY = 0.5  # error of an offset as a share of the delay above the minimum; 0.5 is the bound
 OFFSET_WALK_US = 4.0  # random walk of the offset, per sqrt(s)
 DRIFT_WALK_PPM = 0.05  # random walk of the drift, per sqrt(s)
-DRIFT_PPM = 100.0  # initial standard deviation of the drift, and its limit in the bounds of the offset
+DRIFT_PPM = 100.0  # initial standard deviation of the drift; in the bounds of the offset, it may be so large
 LEAST_OF = 64  # recent exchanges, among which the minimum delay is taken and which bound the offset
 STEP_AFTER = 5  # contradictory exchanges in a row after which the filter restarts: the clock was set
 _SMOOTHING = 1 / 8  # RFC 6298, section 2
@@ -173,17 +173,18 @@ class ClockFilter:
         self._agreeing_exchanges = 1
 
     def _add(self, x: F64, exchange: Exchange, variance: float) -> bool:
-        """Update with an exchange, unless the edge's clock was set: its bounds contradict all recent ones."""
+        """Update with an exchange, unless its bounds contradict the last: the edge's clock was set."""
         self._x, self._P = x, P = self._predict(x, exchange.middle_ns)
         self._updated_ns = max(exchange.middle_ns, self._updated_ns)
-        low, high = self._offset_bounds_us(exchange)
-        if low > high:
+        bounds = self._offset_bounds_us(exchange)
+        if bounds is None:
             self._consecutive_rejects += 1
             self.rejected += 1
             if self._consecutive_rejects >= STEP_AFTER:
                 self.steps += 1
                 self._initialise(exchange)
             return False
+        low, high = bounds
         self._recent.append(exchange)
         x, P = self._measure(x, P, (exchange.offset_ns - self._base_ns) / 1e3, variance)
         if not low <= x[0] <= high:
@@ -201,19 +202,26 @@ class ClockFilter:
         x, P = self._kalman.update(x, P, z, np.array([[variance]]), np.array([[1.0, 0.0]]))
         return x, P
 
-    def _offset_bounds_us(self, exchange: Exchange) -> tuple[float, float]:
-        """Return the least and the largest offset at `_updated_ns` that this and all recent exchanges allow.
+    def _offset_bounds_us(self, exchange: Exchange) -> tuple[float, float] | None:
+        """Return the least and the largest offset at `_updated_ns` that this and the recent exchanges allow;
+        None if this one contradicts the last. Older ones than one that contradicts are left out: the clock's
+        rate has changed since.
 
         A filter alone would leave them where one side waits for a core again and again: exchanges then err in
         one direction."""
-        exchanges = [*self._recent, exchange]
+        assert self._x is not None
+        exchanges = [exchange, *reversed(self._recent)]
         times, offsets, unverified = np.array(
             [(e.middle_ns, e.offset_ns, e.unverified_ns) for e in exchanges]
         ).T
         age_s = np.abs(times - self._updated_ns) / SECOND_NS
-        error_us = unverified / 2e3 + DRIFT_PPM * age_s
+        drift_ppm = max(DRIFT_PPM, abs(float(self._x[1])) + min(3 * math.sqrt(self._P[1, 1]), DRIFT_PPM))
+        error_us = unverified / 2e3 + drift_ppm * age_s
         offset_us = (offsets - self._base_ns) / 1e3
-        return float((offset_us - error_us).max()), float((offset_us + error_us).min())
+        low = np.maximum.accumulate(offset_us - error_us)
+        high = np.minimum.accumulate(offset_us + error_us)
+        last = int(np.flatnonzero(low <= high)[-1])
+        return (float(low[last]), float(high[last])) if last > 0 else None
 
     def _predict(self, x: F64, now_ns: int) -> tuple[F64, F64]:
         """Return state (2,) and covariance (2, 2) at `now_ns`, with random walks of offset and drift."""

@@ -12,9 +12,11 @@ from typing import Any
 from share.errors import ShareError, StoreError, brief_reason
 from share.mapping.map_changes import SaveObject, with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
+from share.runtime.map_reading import MapRead, read_map
 from share.runtime.mapper_process import MapperReport, RestoreMap
 from share.runtime.room_parts import RoomStore
 from share.store.forgetting import damaged_copies
+from share.store.loading import outline_map
 from share.store.salvage import ReadRows
 from share.timing import Backoff
 
@@ -98,16 +100,23 @@ class MapperRestarts:
         """Record that no new session could be started. Return the seconds until the next try."""
         return self._backoff.record_failure(time.monotonic_ns())
 
-    def load_map(self) -> tuple[RestoreMap | None, list[RestoredRun]]:
-        """Return the map for the mapper, and the agents' runs for a new session. Raises StoreError if the
-        file is unreadable now."""
+    @property
+    def store_to_read(self) -> RoomStore | None:
+        """The map file, if the next `load_map` needs its rows."""
+        return None if self._tries >= _MAX_TRIES else self.store
+
+    def load_map(self, read: MapRead | None = None) -> tuple[RestoreMap | None, list[RestoredRun]]:
+        """Return the map for the mapper, and the agents' runs for a new session. read: of `store_to_read`;
+        None: it is read now. Raises StoreError if the file is unreadable now."""
         self._is_restoring = self._has_begun = False
         if self._tries >= _MAX_TRIES:
             self._set_aside(f"{self._tries} mappers in a row have died while restoring it")
+            read = None
         if self.store is None:
             return None, []
         try:
-            restore, outline = RestoreMap(self._rows(self.store), self._has_keys), self.store.outline()
+            rows = self._rows(read or read_map(self.store))
+            restore, outline = RestoreMap(rows, self._has_keys), outline_map(rows)
             outline = with_unknown_credentials(outline) if self._has_keys else outline
             self.forgotten = outline.forgotten if self.forgotten is None else self.forgotten
             known = restored_runs(outline, self._known_m)
@@ -123,14 +132,15 @@ class MapperRestarts:
         self._is_restoring = self._restored_keyframes > 0
         return restore, known
 
-    def _rows(self, store: RoomStore) -> ReadRows:
-        """Return the rows of the file; say what is missing since it was found damaged now."""
-        known = store.problems
-        try:
-            return store.rows()
-        finally:
-            for problem in store.problems[len(known) :]:
-                self._notify(problem)
+    def _rows(self, read: MapRead) -> ReadRows:
+        """Return the rows of the file; say what is missing since it was found damaged now. Raises what
+        reading it has raised."""
+        for problem in read.new_problems:
+            self._notify(problem)
+        if read.error is not None:
+            raise read.error
+        assert read.rows is not None
+        return read.rows
 
     def _set_aside(self, reason: str) -> None:
         self._tries = 0

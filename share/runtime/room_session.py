@@ -135,9 +135,11 @@ class RoomSession:
         return self.map_writer is not None and not self.map_writer.pending_changes
 
     @property
-    def map_trouble(self) -> str | None:
-        """Why changes cannot be saved now, None if they can."""
-        return None if self.map_writer is None else self.map_writer.trouble
+    def troubles(self) -> list[str]:
+        """Why changes cannot be saved now, and which process makes no progress; a line each."""
+        unsaved = None if self.map_writer is None else self.map_writer.trouble
+        stalled = None if self._mapper is None else self.progress.stall()
+        return [text for text in (unsaved, stalled) if text is not None]
 
     def find(self, request: FindKeyframe) -> None:
         """Search a keyframe of another room's agent in the map."""

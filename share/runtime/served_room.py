@@ -16,6 +16,7 @@ from typing import Any
 
 from share.config import Config
 from share.errors import StoreError, brief_reason, describe_exception
+from share.event_kinds import EventKind
 from share.mapping.places import FindKeyframe, KeyframeSought
 from share.protocol.agent_health import trouble_lines
 from share.protocol.common_events import Tick
@@ -36,6 +37,7 @@ from share.protocol.edge_records import SessionTotals
 from share.runtime.blinding import Blinding, NoBlinding
 from share.runtime.edge_observer import EdgeObserver
 from share.runtime.keyframe_handover import KeyframesAdded
+from share.runtime.map_reading import MapRead, MapReading
 from share.runtime.map_writer import CLOSE_S
 from share.runtime.mapper_process import (
     MapperReport,
@@ -49,6 +51,8 @@ from share.runtime.mapper_supervision import TROUBLE_SHOWN_S, MapperRestarts, Re
 from share.runtime.room_host import OtherRooms, RoomHost
 from share.runtime.room_parts import RoomStore, StartMapping
 from share.runtime.room_session import SESSION_EFFECTS, MapNotice, MapperDied, RoomSession, SessionParts
+
+_NOTHING_YET = "nothing is mapped or acknowledged until that is done"
 
 
 class ServedRoom:
@@ -75,6 +79,10 @@ class ServedRoom:
         self._observer, self._blinding, self._others = observer, blinding, others
         self._restarts = MapperRestarts(store, settings.merge.enter_m, self._log_map, has_keys)
         self._restart_due_s: float | None = None  # when a session that waits for the disk starts
+        self._waiting_reason = ""  # why no session has started
+        self._reading: MapReading | None = None  # the map, for the next session
+        self._retry_s = 0.0  # pause before the next try to start a session
+        self._mapper_due_s = 0.0  # when the next session's mapper may start, monotonic
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._stopping = False
         self._troubles = RecentTroubles()
@@ -91,7 +99,8 @@ class ServedRoom:
         """Handle the answers of the room's processes and threads, and the time that has passed."""
         self.handle_answers()
         self.handle(Tick())
-        if self._restart_due_s is not None and time.monotonic() >= self._restart_due_s:
+        is_due = self._restart_due_s is not None and time.monotonic() >= self._restart_due_s
+        if is_due and self._reading is None:
             self._restart_session(self._restarts.record_failure())
 
     def stop(self) -> None:
@@ -122,9 +131,16 @@ class ServedRoom:
         """Close the map file; see `MapWriter.close`. Return why it is incomplete, None if it is complete."""
         if self._session.map_writer is not None:
             return self._session.map_writer.close(timeout_s)
-        if self.is_waiting and self._restarts.store is not None:  # no session could begin: unlock it
-            self._restarts.store.close()
-        return None
+        if not self.is_waiting:
+            return None
+        store = self._restarts.store
+        if self._reading is not None and store is not None and not self._reading.wait(timeout_s):
+            store.abandon()
+            return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
+        if store is not None:  # unlock it
+            store.close()
+        failed = self._reading is None
+        return f"{self._waiting_reason}: keyframes not acknowledged are not in it" if failed else None
 
     def finish(self, incomplete_reason: str | None) -> None:
         """Acknowledge what has been saved at the end."""
@@ -184,14 +200,14 @@ class ServedRoom:
     def report(self) -> dict[str, Any]:
         """Return edge.json without `series` and what only the edge around the room knows."""
         report = self._blinding.covered(self._report_of(self._session))
-        progress, map_trouble = self._session.progress, self._session.map_trouble
+        waiting = [self._waiting_reason] if self.is_waiting else []
         return {
             **report,
             "refused": [*self._other_troubles.current(), *report["refused"]],
-            "trouble": [*self._troubles.current(), *filter(None, (map_trouble, progress.stall()))],
+            "trouble": [*self._troubles.current(), *waiting, *self._session.troubles],
             "degraded": self._restarts.losses,
             "agent_trouble": trouble_lines(report["agents"]),
-            **progress.last_solve(),
+            **self._session.progress.last_solve(),
             **self._restarts.loading(),
         }
 
@@ -205,10 +221,11 @@ class ServedRoom:
 
     # ------------------------------------------------------------------ sessions
 
-    def _start_session(self, start_delay_s: float = 0.0) -> None:
-        """Start a session with the map of the file. start_delay_s: delay of the mapper's start. Raises
-        StoreError if the file is unreadable, and what keeps a process or a thread from starting."""
-        restore, known = (None, []) if self._parts.streams_frames else self._restarts.load_map()
+    def _start_session(self, read: MapRead | None = None) -> None:
+        """Start a session with the map of the file. read: of it; None: it is read now. Raises StoreError if
+        the file is unreadable, and what keeps a process or a thread from starting."""
+        restore, known = (None, []) if self._parts.streams_frames else self._restarts.load_map(read)
+        start_delay_s = max(0.0, self._mapper_due_s - time.monotonic())
         self._session = RoomSession(self._parts, self._restarts, restore, known, start_delay_s)
         if self._others is not None:
             self._others.note_session()
@@ -216,30 +233,63 @@ class ServedRoom:
         store = self._restarts.store
         self._observer.begin_session(None if store is None else store.path, known)
 
-    def _restart_mapping(self, reason: str) -> None:
-        """Start a new session after the mapper died; to the agents this looks like a restart of the edge."""
-        pause_s = self._restarts.record_death()
-        text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
-        self._host.log_event("mapper died", text)
-        self._troubles.add(f"the mapper: {text}", pause_s + TROUBLE_SHOWN_S)
-        self._restart_session(pause_s, start_delay_s=pause_s)
+    def _on_mapper_death(self, reason: str) -> None:
+        if not self._stopping and self.loss is None:
+            self._restart_mapping("mapper died", f"its process {reason}", self._restarts.record_death())
 
-    def _restart_session(self, retry_s: float, start_delay_s: float = 0.0) -> None:
-        """End this session and start a new one; until the map can be read and a process started, nothing is
-        applied or acknowledged. start_delay_s: of the mapper."""
-        self._restart_due_s = time.monotonic() + retry_s  # whatever fails
+    def _on_lost_effect(self, reason: str) -> None:
+        """Go on without a change that mapper or map file need."""
+        if self._stopping:
+            self._log_map(f"a change is lost: {reason}")
+        else:
+            self._restart_mapping("map", f"it lacks a change ({reason})", self._restarts.record_failure())
+
+    def _restart_mapping(self, event: EventKind, reason: str, pause_s: float) -> None:
+        """Start a new session in place of one that cannot go on; to the agents this looks like a restart of
+        the edge."""
+        text = f"{reason}; restarted in {pause_s:g} s; agents resend what is not in the map file"
+        self._host.log_event(event, text if event == "mapper died" else f"the mapper: {text}")
+        self._troubles.add(f"the mapper: {text}", pause_s + TROUBLE_SHOWN_S)
+        self._mapper_due_s = time.monotonic() + pause_s
+        self._restart_session(pause_s)
+
+    def _restart_session(self, retry_s: float) -> None:
+        """End this session, read the map, and start a new one with it. Until then nothing is applied or
+        acknowledged. retry_s: pause before the next try, if this one fails."""
+        self._restart_due_s, self._retry_s = time.monotonic() + retry_s, retry_s
         try:
-            ended = self._session
-            if not ended.end():
+            if not self._session.end():
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
-            self._restarts.objects = ended.state_machine.room.kept_objects()
-            self._restarts.forgotten = ended.state_machine.forgotten_next_keyframes()
-            self._start_session(start_delay_s)
-            self._restart_due_s = None
-            self._add_totals(ended)
+            state_machine = self._session.state_machine
+            self._restarts.objects = state_machine.room.kept_objects()
+            self._restarts.forgotten = state_machine.forgotten_next_keyframes()
+            if (store := self._restarts.store_to_read) is not None:
+                self._waiting_reason = f"the map file is read; {_NOTHING_YET}"
+                self._reading = MapReading(store, self._post)
+            else:
+                self._start_next_session(None)
         except Exception as error:  # the disk; too many open files, or threads
-            self._log_map(f"{brief_reason(error)}; retried in {retry_s:g} s")
+            self._on_failed_restart(error)
+
+    def _start_next_session(self, read: MapRead | None) -> None:
+        ended = self._session
+        self._start_session(read)
+        self._restart_due_s = None
+        self._add_totals(ended)
+
+    def _on_map_read(self, read: MapRead) -> None:
+        self._reading = None
+        try:
+            self._start_next_session(read)
+        except Exception as error:
+            self._on_failed_restart(error)
+
+    def _on_failed_restart(self, error: Exception) -> None:
+        reason = brief_reason(error)
+        self._waiting_reason = f"{reason}; {_NOTHING_YET}"
+        self._restart_due_s = time.monotonic() + self._retry_s
+        self._log_map(f"{reason}; retried in {self._retry_s:g} s")
 
     def _add_totals(self, ended: RoomSession) -> None:
         try:
@@ -278,8 +328,10 @@ class ServedRoom:
             case SolverDied() as solver:
                 self._host.log_event("solver died", solver.text)
                 self._troubles.add(f"the solver: {solver.text}")
-            case MapperDied() as mapper if not self._stopping and self.loss is None:
-                self._restart_mapping(f"its process {mapper.reason}")
+            case MapRead() as read if not self._stopping:
+                self._on_map_read(read)
+            case MapperDied() as mapper:
+                self._on_mapper_death(mapper.reason)
 
     def _discard_answers(self) -> None:
         """Drop answers to a session that is over; log only its notices."""
@@ -299,7 +351,7 @@ class ServedRoom:
                 self._execute(effect)
             except Exception as error:
                 if isinstance(effect, SESSION_EFFECTS):
-                    self._restart_mapping(f"it lacks a change ({describe_exception(error)})")
+                    self._on_lost_effect(describe_exception(error))
                     return
                 errors.append(error)
             try:

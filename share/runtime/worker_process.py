@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from share import startup
+from share.errors import describe_exception
 from share.spawning import SPAWN_CONTEXT
 
 Inbox = queue.SimpleQueue[Any]
@@ -44,6 +45,7 @@ class WorkerProcess:
         self._closing = threading.Event()
         self._starting = threading.Lock()
         self._start_error: str | None = None
+        self._fault: str | None = None  # of this side, for which it was ended
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._parent_end, self._child_end = SPAWN_CONTEXT.Pipe()
         self._process = SPAWN_CONTEXT.Process(
@@ -126,14 +128,21 @@ class WorkerProcess:
                 self._parent_end.send(message)
             except OSError:  # the process has died: `_receive_loop` reports it
                 return
+            except Exception as error:  # such as no memory: without this message it cannot go on
+                self._end_at_fault(f"was ended: a message cannot be sent to it ({describe_exception(error)})")
+                return
             if message is END:
                 return
 
     def _receive_loop(self) -> None:
-        with contextlib.suppress(EOFError, OSError):
+        try:
             while True:
                 answer = self._parent_end.recv()
                 self._on_answer(answer)  # of who waits now, see `attach`
+        except (EOFError, OSError):
+            pass
+        except Exception as error:  # such as no memory: what follows would lack this answer
+            self._end_at_fault(f"was ended: its answer cannot be read ({describe_exception(error)})")
         if not self._closing.is_set():
             self._outbox.put(END)
             reason = self._describe_exit()
@@ -141,9 +150,17 @@ class WorkerProcess:
                 self._death_reason, on_death = reason, self._on_death
             on_death(reason)
 
+    def _end_at_fault(self, reason: str) -> None:
+        """End the process for something on this side; `_receive_loop` reports it."""
+        self._fault = self._fault or reason
+        if self._process.pid is not None:
+            self._process.kill()
+
     def _describe_exit(self) -> str:
         if self._start_error is not None:
             return f"could not be started: {self._start_error}"
+        if self._fault is not None:
+            return self._fault
         self._process.join(_TIMEOUT_S)
         code = self._process.exitcode
         if code is not None and code < 0:

@@ -22,6 +22,7 @@ class KeyframeArchive:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._db: sqlite3.Connection | None = None
+        self._file_id: tuple[int, int] | None = None  # of the open file: a repair replaces it
 
     def jpeg(self, key: KeyframeKey) -> U8 | None:
         """The JPEG (B,) of a keyframe."""
@@ -49,7 +50,9 @@ class KeyframeArchive:
     def _query(self, query: str, key: KeyframeKey) -> tuple[Any, ...]:
         """The first row; () without one, and where the file cannot be read."""
         try:
-            if self._db is None:
+            file_id = self._path.stat().st_dev, self._path.stat().st_ino
+            if self._db is None or file_id != self._file_id:
+                self._file_id = file_id
                 self._db = database.open_for_reading(self._path)
                 self._db.set_progress_handler(None, 0)  # each query reads one row
                 limit_untrusted(self._db, _MAX_ROW_BYTES)

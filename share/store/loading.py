@@ -85,11 +85,15 @@ def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
     tables. now_s: unix s, see `convert`."""
     with translate_errors(path, "opened", writes=True):
         connection = database.open_for_writing(path, durable)
-        connection.execute("BEGIN IMMEDIATE")
-        if schema.is_empty(connection):
-            schema.create(connection)
-        convert(connection, now_s)
-        connection.execute("COMMIT")
+        try:
+            connection.execute("BEGIN IMMEDIATE")
+            if schema.is_empty(connection):
+                schema.create(connection)
+            convert(connection, now_s)
+            connection.execute("COMMIT")
+        except BaseException:  # else it would lock the file for the next try
+            connection.close()
+            raise
     return connection
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from share.errors import StoreError, UsageError
+from share.errors import ShareError, StoreError, UsageError
 from share.files.sqlite_file import wal_path
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import MapChange, StoredMap, Wipe
@@ -29,7 +29,7 @@ from share.store.loading import (
     read_and_repair,
     read_only,
 )
-from share.store.salvage import ReadRows, read_intact_rows, salvage, set_aside
+from share.store.salvage import ReadRows, finish_salvage, read_intact_rows, salvage, set_aside
 
 __all__ = ["MapStore", "is_map", "oldest_arrival_s"]
 
@@ -48,6 +48,7 @@ class MapStore:
         self._opened: ReadRows | None = opened.rows  # None: outdated
         self._outline: StoredMap | None = None  # of `_opened`
         self._db: sqlite3.Connection | None = None
+        self._is_closed = False  # `_db`, since a repair has failed: opened anew when it is needed
         self._file_ids: dict[Path, tuple[int, int]] = {}  # device and inode of the map's files
         self._lock: int | None = None
         self._durable = False
@@ -168,14 +169,31 @@ class MapStore:
             work()
 
     def _repair(self) -> None:
-        """Salvage the file. Not all of it is read when it is opened, so it may be damaged unnoticed."""
-        self._writable_db().close()
+        """Salvage the file. Not all of it is read when it is opened, so it may be damaged unnoticed. Raises
+        StoreError if the disk is full or fails; may be repeated."""
+        self._close_db()
         try:
             salvaged, renamed = salvage(self.path)
-            self.problems = (*self.problems, damage_text(renamed), *decode_map(salvaged).problems)
-        finally:
-            self._opened = self._outline = None
-            self._start_writing()
+        except ShareError as error:
+            raise StoreError(f"{self.path}: the file is damaged and cannot be repaired: {error}") from None
+        self.problems = (*self.problems, damage_text(renamed), *decode_map(salvaged).problems)
+        self._start_writing()
+
+    def _close_db(self) -> None:
+        """Close the writer's connection, until `_start_writing` or `_open_again`. Its log may go with it."""
+        assert self._db is not None
+        self._db.close()
+        self._is_closed = True
+        self._file_ids.pop(wal_path(self.path), None)
+        self._opened = self._outline = None
+
+    def _open_again(self) -> None:
+        """Open the writer's connection after a repair that has failed, perhaps in its last steps."""
+        if (renamed := finish_salvage(self.path)) == self.path:
+            self._check_in_place()
+        else:
+            self.problems = (*self.problems, damage_text(renamed))
+        self._start_writing()
 
     def _start_writing(self) -> None:
         """Open the writer's connection; what that has changed is not in the rows that were read before."""
@@ -183,7 +201,7 @@ class MapStore:
         self._db = open_writer(self.path, self._durable, time.time())
         if self._db.total_changes:
             self._opened = self._outline = None
-        self._file_ids = _read_file_ids(self.path)
+        self._file_ids, self._is_closed = _read_file_ids(self.path), False
 
     def image_bytes(self, keys: Iterable[KeyframeKey]) -> int:
         """Return how many bytes the JPEGs of these keyframes have, as far as the file can be read."""
@@ -212,11 +230,12 @@ class MapStore:
             return self._opened
         if self._db is None:
             return read_only(self.path).rows
-        if (read_rows := self._read_rows(schema.SMALL_TABLES)).is_damaged:
-            self._check_in_place()
-            self._repair()
-            read_rows = self._read_rows(schema.SMALL_TABLES)
-        return read_rows
+        with contextlib.suppress(DamageError):
+            if not (read_rows := self._read_rows(schema.SMALL_TABLES)).is_damaged:
+                return read_rows
+        self._check_in_place()
+        self._repair()
+        return self._read_rows(schema.SMALL_TABLES)
 
     def _read_rows(self, tables: Iterable[str]) -> ReadRows:
         with database.translate_errors(self.path, "read"):
@@ -230,12 +249,9 @@ class MapStore:
         Raises ShareError if that fails: then the map is unchanged, or the new one knows none.
         """
         about = self._read_rows(["about"]).tables["about"]
-        self._writable_db().close()
-        try:
-            renamed = set_aside(self.path)
-        finally:
-            self._opened = self._outline = None
-            self._start_writing()
+        self._close_db()
+        renamed = set_aside(self.path)
+        self._start_writing()
         with database.translate_errors(self.path, "written", writes=True), self._writable_db() as db:
             db.execute("BEGIN IMMEDIATE")
             add_forgotten(db, {**rows.read_forgotten_runs(about)[0], **forgotten})
@@ -279,6 +295,8 @@ class MapStore:
             raise StoreError(
                 f"{self.path}: the map cannot be written: {self.read_only_reason or 'it was closed'}"
             )
+        if self._is_closed:
+            self._open_again()
         return self._db
 
 

@@ -15,7 +15,7 @@ import pytest
 from helpers.map_changes import ANN, BOB, small_map
 from helpers.map_files import is_locked
 
-from share.config import Config, EdgeConfig
+from share.config import Config, EdgeConfig, with_policy
 from share.errors import StoreError
 from share.mapping.corrections import MapEvent
 from share.mapping.loops import KeyframeKey
@@ -404,7 +404,7 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     run, _, events = edge(dies_later)
     unreadable = StoreError("room: the map cannot be read: disk I/O error")
     with monkeypatch.context() as patch:
-        patch.setattr(MapperRestarts, "load_map", lambda self: raises(unreadable)())
+        patch.setattr(MapperRestarts, "load_map", lambda self, read: raises(unreadable)())
         until(lambda: len(reasons(events, "map")) > 1)
     assert reasons(events, "map")[0] == "room: the map cannot be read: disk I/O error; retried in 0.01 s"
     session = run.report()["session"]
@@ -413,10 +413,13 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
 
 def serve(path, start_mapper):
     """A room around which is nothing."""
-    host = types.SimpleNamespace(**dict.fromkeys(("wake", "send", "expect_growth", "record", "log_event")))
-    vars(host).update({name: lambda *_: None for name in vars(host)})
-    given = host, 0, MapStore.open(path), EdgeObservers(), NoBlinding(), False
+    given = host(), 0, MapStore.open(path), EdgeObservers(), NoBlinding(), False
     return ServedRoom(Config(), *given, start_mapper=start_mapper)
+
+
+def host():
+    names = ("wake", "send", "expect_growth", "record", "log_event")
+    return types.SimpleNamespace(**{name: lambda *_: None for name in names})
 
 
 class Process:
@@ -479,6 +482,7 @@ def test_a_map_is_not_to_blame_where_a_mapper_dies_before_it_restores_it(path, q
             on_answer(RestoreBegun())
         on_death("ended with exit code 1")
         room.step()
+        until(lambda: room.step() or not room.is_waiting)
     room.close()
     assert path.with_name("room.sqlite.damaged-1").exists() is has_begun
 
@@ -489,11 +493,11 @@ def test_a_restart_that_fails_is_tried_again_after_a_pause(path, quick, monkeypa
     room = serve(path, lambda on_answer, on_death, delay_s: started.append((on_death, delay_s)) or Process())
     load = MapperRestarts.load_map
 
-    def failing(self):
+    def failing(self, read):
         tries.append(time.monotonic())
         if len(tries) < 4:
             raise MemoryError
-        return load(self)
+        return load(self, read)
 
     monkeypatch.setattr(MapperRestarts, "load_map", failing)
     started[0][0]("was ended by SIGKILL")
@@ -509,10 +513,72 @@ def test_a_room_that_waits_for_its_map_unlocks_the_file_at_the_end(path, quick, 
     monkeypatch.setattr(room_session, "MapWriter", lambda *_: {}["none"])
     started[0]("was ended by SIGKILL")
     room.step()
+    until(lambda: room.step() or "KeyError" in room.report()["trouble"][-1])
+    assert "nothing is mapped or acknowledged until that is done" in room.report()["trouble"][-1]
     assert room.is_waiting
     assert is_locked(path)
-    assert room.close() is None
+    assert "keyframes not acknowledged are not in it" in (room.close() or "")
     assert not is_locked(path)
+
+
+@pytest.mark.parametrize("is_answered", [False, True])
+def test_a_room_that_is_closed_while_its_map_is_read_waits_for_that(path, quick, monkeypatch, is_answered):
+    started: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
+    may_read, rows = threading.Event(), MapStore.rows
+    monkeypatch.setattr(MapStore, "rows", lambda store: may_read.wait() and rows(store))
+    started[0]("was ended by SIGKILL")
+    room.step()
+    assert "the map file is read; nothing is mapped" in room.report()["trouble"][-1]
+    for _ in range(3):
+        time.sleep(0.02)
+        room.step()  # does not wait
+    room.end_processes()
+    if is_answered:
+        may_read.set()
+    reason = room.close_file(0.05 if not is_answered else 60.0)
+    assert ("does not answer" in (reason or "")) is not is_answered
+    assert is_locked(path) is not is_answered
+    may_read.set()
+    room.finish(reason)
+
+
+def test_a_change_that_is_lost_at_the_end_starts_no_mapper(path):
+    """Its process would have outlived the room."""
+    started: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
+    room.end_processes()
+    room._session.map_writer.submit = lambda request: {}["none"]
+    room.execute([SaveChanges(1, (RemoveKeyframes((KeyframeKey("ann-0003", 7),)),))])
+    assert len(started) == 1
+    room.close_file()
+    room.finish(None)
+
+
+def test_a_map_is_not_to_blame_for_changes_that_are_lost_while_it_is_restored(path, quick):
+    started: list = []
+    room = serve(
+        path, lambda on_answer, on_death, delay_s: started.append((on_answer, on_death)) or Process()
+    )
+    for n in range(5):
+        started[-1][0](RestoreBegun())
+        room.step()
+        room._session.map_writer.submit = lambda request: {}["none"]
+        room.execute([SaveChanges(n, (RemoveKeyframes((KeyframeKey("ann-0003", 7),)),))])
+        until(lambda: room.step() or not room.is_waiting)
+    assert len(started) == 6
+    room.close()
+    assert not path.with_name("room.sqlite.damaged-1").exists()
+
+
+def test_an_edge_without_a_mapper_misses_no_report(monkeypatch):
+    """Policy streamed was in trouble for ever, a minute after its start."""
+    settings = with_policy(Config(), "streamed")
+    room = ServedRoom(settings, host(), 0, None, EdgeObservers(), NoBlinding(), False)
+    now_s = time.monotonic()
+    monkeypatch.setattr(mapper_supervision.time, "monotonic", lambda: now_s + 100.0)
+    assert room.report()["trouble"] == []
+    room.close()
 
 
 def test_a_session_goes_on_without_what_nobody_needs_only(path, quick):
@@ -529,7 +595,7 @@ def test_a_session_goes_on_without_what_nobody_needs_only(path, quick):
     room._session.map_writer.submit = lambda request: {}["none"]
     room.execute([save, SendToPeer(b"ann", (b"2",))])
     assert sent == [(b"1",)]  # such as an acknowledgement of what is not in the file
-    assert room.report()["session"] != before
+    until(lambda: room.step() or room.report()["session"] != before)
     assert "it lacks a change (KeyError: 'none'" in room.report()["trouble"][0]
     room.close()
 
