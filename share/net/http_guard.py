@@ -148,7 +148,10 @@ def http_address(option: str, text: str, token: str | None) -> Address:
 
     Raises UsageError if it is malformed, or reachable from other machines without a token.
     """
-    address = served_address(text)
+    try:
+        address = served_address(text)
+    except UsageError as error:
+        raise UsageError(f"{option} {error}") from None
     if token is None and not address.local:
         raise UsageError(
             f"{option} {text}: others could read it; add --http-token FILE (made if it is not there), "

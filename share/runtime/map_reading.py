@@ -6,16 +6,17 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from share.mapping.map_changes import StoredMap
 from share.runtime.room_parts import RoomStore
 from share.store.salvage import ReadRows
 
 
 @dataclass(frozen=True, eq=False)
 class MapRead:
-    """The rows of a map file, or why they cannot be read. new_problems: of the file, found meanwhile, a line
-    each."""
+    """The rows of a map file and what runs continue from, or why they cannot be read. new_problems: of the
+    file, found meanwhile, a line each."""
 
-    rows: ReadRows | None
+    found: tuple[ReadRows, StoredMap] | None
     error: Exception | None
     new_problems: tuple[str, ...]
 
@@ -23,13 +24,13 @@ class MapRead:
 def read_map(store: RoomStore) -> MapRead:
     """Read the rows of a map file, and repair it if it is damaged."""
     known = len(store.problems)
-    rows: ReadRows | None = None
+    found: tuple[ReadRows, StoredMap] | None = None
     error: Exception | None = None
     try:
-        rows = store.rows()
+        found = store.rows(), store.outline()
     except Exception as reason:
         error = reason
-    return MapRead(rows, error, store.problems[known:])
+    return MapRead(found, error, store.problems[known:])
 
 
 class MapReading:

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from share.errors import ShareError, StoreError, brief_reason
-from share.mapping.map_changes import SaveObject, with_unknown_credentials
+from share.mapping.map_changes import SaveObject, StoredMap, with_unknown_credentials
 from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.map_reading import MapRead, read_map
 from share.runtime.mapper_process import MapperReport, RestoreMap
 from share.runtime.room_parts import RoomStore
 from share.store.forgetting import damaged_copies
-from share.store.loading import outline_map
 from share.store.salvage import ReadRows
 from share.timing import Backoff
 
@@ -115,8 +114,8 @@ class MapperRestarts:
         if self.store is None:
             return None, []
         try:
-            rows = self._rows(read or read_map(self.store))
-            restore, outline = RestoreMap(rows, self._has_keys), outline_map(rows)
+            rows, outline = self._found(read or read_map(self.store))
+            restore = RestoreMap(rows, self._has_keys)
             outline = with_unknown_credentials(outline) if self._has_keys else outline
             self.forgotten = outline.forgotten if self.forgotten is None else self.forgotten
             known = restored_runs(outline, self._known_m)
@@ -132,15 +131,15 @@ class MapperRestarts:
         self._is_restoring = self._restored_keyframes > 0
         return restore, known
 
-    def _rows(self, read: MapRead) -> ReadRows:
-        """Return the rows of the file; say what is missing since it was found damaged now. Raises what
-        reading it has raised."""
+    def _found(self, read: MapRead) -> tuple[ReadRows, StoredMap]:
+        """Return what was read; say what is missing since the file was found damaged now. Raises what reading
+        it has raised."""
         for problem in read.new_problems:
             self._notify(problem)
         if read.error is not None:
             raise read.error
-        assert read.rows is not None
-        return read.rows
+        assert read.found is not None
+        return read.found
 
     def _set_aside(self, reason: str) -> None:
         self._tries = 0

@@ -228,6 +228,8 @@ def _check_address(address: str) -> None:
             connection.settimeout(3.0)
             connection.sendall(_HTTP2_HELLO)
             head = connection.recv(9)
+    except UnicodeError:
+        raise UsageError(f"--ray {address}: '{host}' is no name of a machine") from None
     except OSError as error:
         reason = error.strerror or str(error)
         raise ShareError(

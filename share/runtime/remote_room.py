@@ -27,7 +27,8 @@ from share.store.salvage import ReadRows
 
 _SILENT_S = 10.0  # without an answer of a worker that has nothing to wait for: its machine is gone
 _OPEN_S = 120.0  # for a map file to be opened, and repaired
-_LOOP_S = 10.0  # for what the loop waits for: after the death of a mapper only
+_LOOP_S = 10.0  # for what the loop waits for: a map that is set aside
+_READ_S = 60.0  # for a map file that is read anew, and repaired if it is damaged, in a thread
 _END_S = 30.0  # for the last answers and for closing the file, at the end
 
 
@@ -109,7 +110,7 @@ class RemoteStore:
 
     def _described(self) -> OpenedFile:
         if self._opened is None:
-            self._opened = opened = self._room.call("describe_map", timeout_s=_LOOP_S)
+            self._opened = opened = self._room.call("describe_map", timeout_s=_READ_S)
             self.problems = opened.problems  # it may have been repaired
         return self._opened
 

@@ -83,17 +83,15 @@ def _opened(read_rows: ReadRows) -> OpenedMap:
 def open_writer(path: Path, durable: bool, now_s: float) -> sqlite3.Connection:
     """Open the writer's connection to a file that `read_and_repair` has checked; create or convert its
     tables. now_s: unix s, see `convert`."""
-    with translate_errors(path, "opened", writes=True):
-        connection = database.open_for_writing(path, durable)
-        try:
+    with contextlib.ExitStack() as stack:  # a connection that stays open locks the file for the next try
+        with translate_errors(path, "opened", writes=True):
+            connection = stack.enter_context(contextlib.closing(database.open_for_writing(path, durable)))
             connection.execute("BEGIN IMMEDIATE")
             if schema.is_empty(connection):
                 schema.create(connection)
             convert(connection, now_s)
             connection.execute("COMMIT")
-        except BaseException:  # else it would lock the file for the next try
-            connection.close()
-            raise
+        stack.pop_all()
     return connection
 
 

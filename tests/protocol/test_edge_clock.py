@@ -217,6 +217,29 @@ def test_the_bound_holds_where_one_side_waits_for_a_core(seed: int, n: int, wait
     assert np.sqrt(np.mean(np.square(errors[n // 2 :]))) < 2000
 
 
+@pytest.mark.parametrize("drift_ppm", [-400.0, 250.0, 300.0])
+def test_the_bound_holds_where_clocks_drift_apart_fast(drift_ppm: float) -> None:
+    """Bounds by a drift of 100 ppm at most contradicted each other: 56 steps in five minutes."""
+    world, clock = World(2, drift_ppm=drift_ppm), ClockFilter()
+    for k, stamps in enumerate(world.exchanges(600)):
+        clock.update(*stamps)
+        if k > 4:
+            assert clock.asymmetry_ns is not None
+            assert error_us(clock, world, stamps[3]) <= clock.asymmetry_ns / US + 1.0
+    assert clock.steps == clock.rejected == 0
+
+
+def test_bounds_from_before_a_change_of_the_rate_are_left_out() -> None:
+    """As the time service slews a clock."""
+    slow, fast, clock = World(5, drift_ppm=0.0), World(6, drift_ppm=150.0), ClockFilter()
+    fast.offset_ns -= round(150e-6 * 100 * S)  # equal at 100 s
+    for k in range(400):
+        world = slow if k < 200 else fast
+        clock.update(*next(world.exchanges(1, start=k)))
+    assert clock.steps == 0
+    assert abs(error_us(clock, fast, 200 * S)) < 400  # 200 us a way; 15,000 by bounds from before
+
+
 MS = 1000 * US
 END = 120 * S
 

@@ -86,7 +86,7 @@ def test_what_is_wrong_with_a_rooms_file_is_a_line(tmp_path):
         (["attic=8081"], "--view attic=8081: there is no room 'attic'; there are hall, kitchen"),
         (["hall=8081", "hall=8082"], "--view hall=8082: room 'hall' is shown already; give it once"),
         (["hall=8081", "kitchen=8081"], "--view hall and --view kitchen name the same port 8081"),
-        (["hall=a b:1"], "'a b:1' is not an address to serve at"),
+        (["hall=a b:1"], "--view hall 'a b:1' is not an address to serve at"),
     ],
 )
 def test_a_view_that_cannot_be_is_a_line(tmp_path, views, line):

@@ -153,6 +153,12 @@ def test_what_a_dead_actor_says_is_a_line(world: World) -> None:
         worker.call("greet")
 
 
+@pytest.mark.parametrize("host", ["a..b", 70 * "a", "\udcff"])
+def test_a_host_that_cannot_be_looked_up_is_refused(host: str) -> None:
+    with pytest.raises(UsageError, match="is no name of a machine"):
+        ray_cluster._check_address(f"{host}:6379")
+
+
 @pytest.mark.parametrize("address", ["", "here", "ray://a:1", "a:0", "a:99999", ":6379", "a:6379/x"])
 def test_what_is_no_address_is_refused(world: World, address: str) -> None:
     with pytest.raises(UsageError, match="give HOST:PORT, auto or local"):

@@ -153,3 +153,44 @@ def test_a_process_without_a_thread_to_talk_to_it_is_ended(
     for thread in started:
         thread.join(10)
         assert not thread.is_alive()
+
+
+class _Unsendable:
+    def __reduce__(self) -> Any:
+        raise MemoryError
+
+
+class _Unreadable:
+    """What the process itself can read, and the other side cannot."""
+
+    def __reduce__(self) -> Any:
+        return _read_in_the_process, ()
+
+
+def _read_in_the_process() -> _Unreadable:
+    if multiprocessing.parent_process() is None:
+        raise MemoryError
+    return _Unreadable()
+
+
+def echoes(inbox: Inbox, answer: Callable[[Any], None]) -> None:
+    while (message := inbox.get()) is not END:
+        answer(message)
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (_Unsendable(), "was ended: a message cannot be sent to it (MemoryError"),
+        (_Unreadable(), "was ended: its answer cannot be read (MemoryError"),
+    ],
+    ids=["sent", "received"],
+)
+def test_short_memory_for_a_message_is_the_death_of_the_process(message: Any, reason: str) -> None:
+    """Its thread ended without a word: nothing was mapped any more, and nobody restarted it."""
+    died: queue.SimpleQueue[str] = queue.SimpleQueue()
+    worker = WorkerProcess("echoes", echoes, (), lambda answer: None, died.put)
+    worker.send(message)
+    assert died.get(timeout=60).startswith(reason)
+    assert worker.is_dead
+    worker.close()

@@ -60,6 +60,17 @@ def test_views_of_removed_keyframes_and_runs_leave_nothing(path: Path) -> None:
     assert counts == [(0,), (0,)]
 
 
+def test_a_file_that_takes_the_place_of_the_first_is_read(path: Path) -> None:
+    """As after a repair: what was saved later was not found."""
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        archive = KeyframeArchive(path)
+        assert archive.has_jpeg(KEY) and not archive.has_jpeg(KeyframeKey(ANN, 40))
+        store.set_aside({})
+        store.write([run(ANN), keyframe(ANN, 40)])
+        assert not archive.has_jpeg(KEY) and archive.has_jpeg(KeyframeKey(ANN, 40))
+
+
 def test_a_missing_file_has_nothing(path: Path) -> None:
     assert KeyframeArchive(path).view(KEY) is None and not KeyframeArchive(path).has_jpeg(KEY)
 

@@ -11,7 +11,7 @@ from helpers.map_changes import ANN, BOB, as_values, keyframe, run, small_map, s
 from share.errors import ShareError, StoreError
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveKeyframes, SaveLink
-from share.store import salvage
+from share.store import map_store, salvage
 from share.store.map_store import MapStore, is_map
 from share.store.schema import PAGE_BYTES
 
@@ -304,6 +304,56 @@ def test_damage_that_comes_while_the_map_is_open_is_repaired_and_said(large):
     assert lost and f"{lost} keyframes could not be read" in store.problems
     store.write([keyframe(ANN, 301)])
     assert len(store.rows().tables["keyframe"]) == len(read_rows.tables["keyframe"]) + 1
+
+
+@pytest.mark.parametrize("how", ["rows", "write"])
+def test_a_repair_that_fails_is_tried_again(large, monkeypatch, how):
+    """As on a full disk. The file stayed shut until the edge was restarted, and "was removed"."""
+    store, path = large
+    overwrite_pages(path, range(2, 90, 3))
+    repair = store.rows if how == "rows" else lambda: store.write([keyframe(ANN, 301)])
+
+    def full(*_):
+        raise ShareError("x.part: cannot be written: No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(map_store, "salvage", full)
+        for _ in range(3):  # a writer waits for StoreError: of another error, only the change is lost
+            with pytest.raises(StoreError, match="damaged and cannot be repaired: x.part: .* No space left"):
+                repair()
+    assert store.problems == ()
+    repair()
+    assert store.problems[0].startswith("the file was damaged; it is kept as room.sqlite.damaged-1")
+    store.write([keyframe(ANN, 302)])
+    assert not store.rows().is_damaged
+
+
+def test_a_repair_that_ended_in_its_last_step_is_finished_and_said(large, monkeypatch):
+    store, path = large
+    overwrite_pages(path, range(40, 90, 3))
+
+    def interrupted(path):
+        raise ShareError(f"{path}: cannot be written: it fails")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(salvage, "finish_salvage", interrupted)
+        with pytest.raises(StoreError, match="it fails"):
+            store.rows()
+    assert not store.rows().is_damaged
+    assert store.problems[0].startswith("the file was damaged; it is kept as room.sqlite.damaged-1")
+
+
+def test_a_file_that_is_removed_after_a_repair_has_failed_is_missed(large, monkeypatch):
+    store, path = large
+    overwrite_pages(path, range(2, 90, 3))
+    with monkeypatch.context() as patch:
+        patch.setattr(map_store, "salvage", lambda path: (_ for _ in ()).throw(ShareError("it fails")))
+        with pytest.raises(StoreError, match="it fails"):
+            store.rows()
+    path.unlink()
+    with pytest.raises(StoreError, match="was removed while the edge ran"):
+        store.write([keyframe(ANN, 301)])
+    assert not path.exists()
 
 
 def test_a_file_that_was_replaced_is_not_repaired_in_its_place(large, whole):
