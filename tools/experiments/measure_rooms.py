@@ -174,7 +174,7 @@ def _search(
     """Let the rooms that look like a keyframe search it, at once."""
     keyframe = agent.keyframes[ranking.key.id]
     now_ns, found = keyframe.stamp_ns, None
-    for room in finder.choose_rooms(ranking, now_ns):
+    for room in finder.choose_rooms(ranking, keyframe.T_odom_body, now_ns):
         mapper = rooms[room].mapper
         mapper.search.add(FindKeyframe(ranking.key, keyframe, agent.hello.rig))
         rooms[room].work()
