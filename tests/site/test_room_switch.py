@@ -13,7 +13,7 @@ from helpers.site_sim import Site, T_map_world, Walker
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.common_events import Connected, PrintLine
-from share.protocol.edge_events import PeerMessageReceived
+from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
 from share.site import room_switch
 from share.site.room_switch import RoomSwitch
 from share.wire.codec import encode
@@ -207,8 +207,20 @@ def test_keyframes_of_a_silent_run_are_kept_for_a_minute_only():
     (key,) = (run for run in site.switch._keyframes if run.startswith("ann-"))
     site.switch.tick(site.now_ns + 50_000 * MS)
     assert key in site.switch._keyframes
+    assert key in site.switch._finder._runs
     site.switch.tick(site.now_ns + 61_000 * MS)
     assert not site.switch._keyframes
+    assert not site.switch._finder._runs
+
+
+def test_odometry_that_begins_anew_ends_what_was_found():
+    site = two_rooms(17)
+    (key,) = (run for run in site.switch._keyframes if run.startswith("ann-"))
+    assert [one.room for one in site.switch._finder._runs[key].finds] == ["lab"]
+    keyframe = site.keyframes("ann")[-1]
+    for reference, finds in ((keyframe.id - 1, 1), (-1, 0)):
+        site.switch.add_keyframe(AddKeyframe(key, replace(keyframe, reference=reference), False), site.now_ns)
+        assert len(site.switch._finder._runs[key].finds) == finds
 
 
 def test_a_name_that_no_room_lets_in_has_no_room():
