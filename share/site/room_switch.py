@@ -118,6 +118,8 @@ class RoomSwitch:
 
     def add_keyframe(self, added: AddKeyframe, now_ns: int) -> None:
         """Keep a keyframe that a room's mapper gets, in case other rooms are to search it."""
+        if added.keyframe.reference < 0:
+            self._finder.begin_segment(added.key)
         kept = self._keyframes.setdefault(added.key, _NewestKeyframes())
         self._keyframes.move_to_end(added.key)
         kept.last_ns = now_ns
@@ -128,13 +130,14 @@ class RoomSwitch:
             self._keyframes.popitem(last=False)
 
     def tick(self, now_ns: int) -> None:
-        """Do what time makes due: changes of rooms that wait, keyframes that nobody will search."""
+        """Do what time makes due: changes of rooms that wait, runs that have fallen silent."""
         self._move_waiting(now_ns)
         while self._keyframes:
             run = next(iter(self._keyframes))
             if now_ns - self._keyframes[run].last_ns <= seconds_to_ns(_KEPT_S):
                 break
             del self._keyframes[run]
+            self._finder.forget(run)
 
     def add_ranking(self, ranking: RoomRanking, now_ns: int) -> None:
         """Have the rooms search a keyframe that look like it."""
@@ -144,7 +147,7 @@ class RoomSwitch:
             return
         allowed = tuple(one for one in ranking.scores if self._may_enter(one.room, peer.name))
         ranking = RoomRanking(ranking.room, ranking.key, allowed)
-        for room in self._finder.choose_rooms(ranking, now_ns):
+        for room in self._finder.choose_rooms(ranking, keyframe.T_odom_body, now_ns):
             self._rooms[room].find(FindKeyframe(ranking.key, keyframe, peer.hello.rig))
 
     def add_answer(self, room: str, sought: KeyframeSought, now_ns: int) -> None:

@@ -24,7 +24,7 @@ def after_a_change(folder: Path) -> Site:
     site = Site([ann, bob], ROOMS, REFUSED, folder=folder)
     site.walk(30)
     site.run(1000)
-    assert stored(site) == {"kitchen": set(range(17)), "lab": set(range(17, 30))}
+    assert stored(site) == {"kitchen": set(range(18)), "lab": set(range(18, 30))}
     return site
 
 
@@ -57,8 +57,8 @@ def test_what_was_forgotten_in_a_room_comes_back_in_none(tmp_path: Path, forgett
     site.walk(6)
     site.run(1000)
     kept = stored(site)
-    assert {k for k in kept["kitchen"] if k < 30} == (set() if "kitchen" in forgetting else set(range(17)))
-    assert {k for k in kept["lab"] if k < 30} == (set() if "lab" in forgetting else set(range(17, 30)))
+    assert {k for k in kept["kitchen"] if k < 30} == (set() if "kitchen" in forgetting else set(range(18)))
+    assert {k for k in kept["lab"] if k < 30} == (set() if "lab" in forgetting else set(range(18, 30)))
     assert {k for room in ROOMS for k in kept[room] if k >= 30} == set(range(30, 38))
     assert site.agents[site.peer("ann")].report()["unacknowledged"] == 0
     assert site.events("internal error") == site.events("step failed") == []
@@ -99,4 +99,4 @@ def test_an_agent_that_was_forgotten_while_away_keeps_its_session(tmp_path: Path
     site.walk(2)
     assert site.room_of("ann") == "lab"
     assert agent.report()["edge_sessions"] == 1
-    assert stored(site) == {"kitchen": set(range(17)), "lab": {30, 31}}
+    assert stored(site) == {"kitchen": set(range(18)), "lab": {30, 31}}

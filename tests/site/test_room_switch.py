@@ -13,7 +13,7 @@ from helpers.site_sim import Site, T_map_world, Walker
 from share.geometry import se3
 from share.protocol import agent_events as ev
 from share.protocol.common_events import Connected, PrintLine
-from share.protocol.edge_events import PeerMessageReceived
+from share.protocol.edge_events import AddKeyframe, PeerMessageReceived
 from share.site import room_switch
 from share.site.room_switch import RoomSwitch
 from share.wire.codec import encode
@@ -55,13 +55,13 @@ def test_an_agent_goes_on_in_the_next_room(walked):
     ]
     assert walked.room_of("ann") == walked.room_of("bob") == "lab"
     entered_s = walked.events("room changed")[1]["t_s"]
-    assert 16 * 0.25 <= entered_s <= 16 * 0.25 + 0.1  # by its first keyframe there; a step takes 5 ms
+    assert 17 * 0.25 <= entered_s <= 17 * 0.25 + 0.1  # by its second keyframe there; a step takes 5 ms
 
 
 def test_each_keyframe_is_in_one_room(walked):
     kept = kept_keyframes(walked, "ann")
-    assert kept["kitchen"] == list(range(17))
-    assert kept["lab"] == list(range(17, 40))
+    assert kept["kitchen"] == list(range(18))
+    assert kept["lab"] == list(range(18, 40))
     report = walked.agents[walked.peer("ann")].report()
     assert report["unacknowledged"] == report["pending"] == 0
     assert report["sent"] == 40
@@ -71,12 +71,12 @@ def test_each_keyframe_is_in_one_room(walked):
 def test_many_strangers_do_not_take_an_agent_back_to_the_room_that_it_left(monkeypatch):
     """Both rooms know it, by as many keyframes: it was in both at once."""
     monkeypatch.setattr(room_switch, "_MAX_ROUTES", 2)
-    site = two_rooms(frames=16)
+    site = two_rooms(frames=17)
     site.walk(1)
     while not site.switch.changes:
         site.run(1)
     ann = site.peer("ann")
-    assert {room: one.knows(ann) for room, one in site.rooms.items()} == {"kitchen": 17, "lab": 17}
+    assert {room: one.knows(ann) for room, one in site.rooms.items()} == {"kitchen": 18, "lab": 18}
     for k in range(3):
         site.to_edge(PeerMessageReceived(bytes([k]) * 16, [bytes(f) for f in encode(Ping(1, 1))]))
     site.run(700)
@@ -94,7 +94,7 @@ def test_the_place_in_the_new_map_is_right_at_once(walked):
     ann, poses = walked.people[walked.peer("ann")], walked.poses("ann")
     bob_map = T_map_world(walked.people[walked.peer("bob")], walked.poses("bob")[-1], 39)
     first = next(i for i, pose in enumerate(poses) if (pose.map_id or "").startswith("bob-"))
-    assert first == 17
+    assert first == 18
     for frame in range(first, 40):
         assert poses[frame].map_id.startswith("bob-")  # never into a map of its own on the way
         T = se3.inverse(bob_map) @ T_map_world(ann, poses[frame], frame)
@@ -132,7 +132,7 @@ def test_it_may_come_back():
     assert [room for room, _ in changes_of(site)] == ["kitchen", "lab", "lab", "kitchen"]
     kept = kept_keyframes(site, "ann")
     assert sorted(kept["kitchen"] + kept["lab"]) == list(range(60))
-    assert min(kept["lab"]) == 19
+    assert min(kept["lab"]) == 20
     assert max(kept["lab"]) < 58  # it looks where it has looked before from some 54 on
     assert site.events("internal error") == site.events("step failed") == []
     maps = [pose.map_id for pose in site.poses("ann")]
@@ -207,8 +207,20 @@ def test_keyframes_of_a_silent_run_are_kept_for_a_minute_only():
     (key,) = (run for run in site.switch._keyframes if run.startswith("ann-"))
     site.switch.tick(site.now_ns + 50_000 * MS)
     assert key in site.switch._keyframes
+    assert key in site.switch._finder._runs
     site.switch.tick(site.now_ns + 61_000 * MS)
     assert not site.switch._keyframes
+    assert not site.switch._finder._runs
+
+
+def test_odometry_that_begins_anew_ends_what_was_found():
+    site = two_rooms(17)
+    (key,) = (run for run in site.switch._keyframes if run.startswith("ann-"))
+    assert [one.room for one in site.switch._finder._runs[key].finds] == ["lab"]
+    keyframe = site.keyframes("ann")[-1]
+    for reference, finds in ((keyframe.id - 1, 1), (-1, 0)):
+        site.switch.add_keyframe(AddKeyframe(key, replace(keyframe, reference=reference), False), site.now_ns)
+        assert len(site.switch._finder._runs[key].finds) == finds
 
 
 def test_a_name_that_no_room_lets_in_has_no_room():
