@@ -319,7 +319,7 @@ def test_a_repair_that_fails_is_tried_again(large, monkeypatch, how):
     with monkeypatch.context() as patch:
         patch.setattr(map_store, "salvage", full)
         for _ in range(3):  # a writer waits for StoreError: of another error, only the change is lost
-            with pytest.raises(StoreError, match="damaged and cannot be repaired: x.part: .* No space left"):
+            with pytest.raises(StoreError, match=r"damaged and cannot be repaired: x.part: .* No space left"):
                 repair()
     assert store.problems == ()
     repair()
