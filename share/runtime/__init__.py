@@ -1,5 +1,5 @@
-"""The processes, their threads and queues: `agent.AgentRun`, `edge.EdgeRun` with its `served_room`,
-`mapper_process`.
+"""The processes, their threads and queues: `agent.AgentRun`, `edge.EdgeRun` with its `served_room` (in it a
+`room_session`), `mapper_process`.
 
 Without an edge: `offline_tracking.track`.
 
