@@ -70,12 +70,7 @@ class MapWriter:
     def close(self, timeout_s: float = CLOSE_S) -> str | None:
         """Drain and close the file; abandon it where that takes longer than `timeout_s`. Return why the
         file is or may be incomplete, None if it is complete."""
-        try:
-            is_drained = self.drain(timeout_s)
-        except BaseException:  # such as no thread to be had: a file that stays open stays locked
-            self._store.close()
-            raise
-        if not is_drained:
+        if not self.drain(timeout_s):
             self._store.abandon()
             return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
         self._store.close()

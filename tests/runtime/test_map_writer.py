@@ -6,7 +6,6 @@ from collections import deque
 
 import numpy as np
 import pytest
-from helpers.map_files import is_locked
 
 from share.errors import StoreError
 from share.mapping.loops import KeyframeKey
@@ -14,7 +13,6 @@ from share.mapping.map_changes import RemoveLoops, SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
 from share.runtime import map_writer
 from share.runtime.map_writer import MapWriter, newest_poses_only
-from share.store.map_store import MapStore
 
 FULL = "/room.sqlite: the map cannot be written: No space left on device"
 
@@ -181,18 +179,3 @@ def test_close_does_not_wait_for_a_disk_that_does_not_answer(opened):
     disk.go_on.set()
     until(lambda: tickets == [ChangesSaved(0)])  # it was written after all
     assert writer.drain(1.0)
-
-
-def test_a_file_is_unlocked_also_where_the_thread_cannot_end_it(tmp_path, monkeypatch):
-    """Its room was shut until the restart: "another edge uses this map; stop it"."""
-
-    def fails(self, timeout_s):
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(map_writer.JobThread, "stop", fails)
-    path = tmp_path / "room.sqlite"
-    writer = MapWriter(MapStore.open(path), lambda saved: None, lambda text: None)
-    with pytest.raises(RuntimeError):
-        writer.close()
-    assert not is_locked(path)
-    MapStore.open(path).close()
