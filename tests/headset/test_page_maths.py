@@ -204,6 +204,77 @@ def test_of_clock_samples_the_least_round_trip_counts(modules: BrowserPage) -> N
     assert found == [None, 1000, 4]
 
 
+def test_a_clock_is_kept_until_a_sample_contradicts_it(modules: BrowserPage) -> None:
+    """After a reconnection to an edge that is busy answers take long, and say little."""
+    found = run(
+        modules,
+        "clock",
+        """(() => {
+            const clock = new m.ServerClock(), said = [];
+            const add = (...sample) => { clock.add(...sample); said.push([clock.toPage(6000), clock.sigmaMs]); };
+            add(200, 5202, 204);  // 5000 ahead
+            add(900, 6300, 1300);  // within its bounds: 200 more or less
+            add(2000, 9000, 2012);  // 6994 ahead: the server's machine has started anew
+            add(3000, 9998, 3004);
+            return said;
+        })()""",
+    )
+    sigmas_ms = [2 / np.sqrt(3), 2 / np.sqrt(3), 6 / np.sqrt(3), 2 / np.sqrt(3)]
+    assert np.allclose(found, np.transpose([[1000, 1000, -994, -996], sigmas_ms]))
+
+
+def test_how_fast_a_viewer_moves_and_turns(modules: BrowserPage) -> None:
+    T = [columns(se3.exp(np.array([0.0, 0.02, 0, 0, 0, 0.01]) * k)) for k in range(3)]
+    script = """(() => {
+        const history = new m.ViewerHistory();
+        poses.forEach((T, k) => history.add(1000 + 20 * k, Float64Array.from(T)));
+        return [1005, 1040, 999, 1041].map((time) => Object.values(history.speedsAt(time)));
+    })()"""
+    found = run(modules, "viewer-history", script, poses=T)
+    assert np.allclose(found, [[1.0, 0.5], [1.0, 0.5], [0, 0], [0, 0]], atol=1e-4)
+
+
+def test_poses_whose_time_is_hardly_known_move_no_alignment_of_one_who_turns(modules: BrowserPage) -> None:
+    """Their times are 150 ms wrong for 3 s: the space was aligned anew, and again once they were right."""
+    found = run(
+        modules,
+        "placement",
+        """(() => {
+            const told = [], placement = new m.Placement((text) => told.push(text));
+            placement.setMount(Float64Array.from(mount), 0);
+            const cov = Float64Array.from({ length: 36 }, (_, k) => (k % 7 === 0 ? 1e-5 : 0));
+            const x = [];
+            viewers.forEach((T, k) => {
+                const isWrong = k >= 200 && k < 400;
+                const [timeMs, timeSigmaMs] = isWrong ? [15 * k - 165, sigmaMs] : [15 * k - 15, 1];
+                if (k > 20 && k % 3 === 0) {
+                    const [T_map_body, at] = [Float64Array.from(bodies[k - 1]), timeMs];
+                    placement.addPose({ timeMs: at, timeSigmaMs, mapId: "a", T_map_body, cov });
+                }
+                placement.update(15 * k, Float64Array.from(T));
+                if (k > 30) x.push([...placement.T_map_local].slice(12, 15));
+            });
+            return [told.filter((text) => text.includes("anew")).length, x];
+        })()""",
+        mount=columns(worn.T_body_viewer),
+        **turning(),
+        sigmaMs=150.0,
+    )
+    anew, places = found
+    assert anew <= 1  # the first
+    assert np.linalg.norm(np.array(places) - places[0], axis=1).max() < 0.1
+
+
+def turning() -> dict[str, list[list[float]]]:
+    """Who looks about at up to 1.3 rad/s and walks: viewers in the headset's space, bodies in the map."""
+    viewers = [
+        se3.from_rt(se3.so3_exp(np.array([0, 0.8 * np.sin(0.024 * k), 0])), np.array([0.005 * k, 1.6, 0]))
+        for k in range(600)
+    ]
+    bodies = [T @ se3.inverse(worn.T_body_viewer) for T in viewers]
+    return {"viewers": list(map(columns, viewers)), "bodies": list(map(columns, bodies))}
+
+
 def test_percentiles(modules: BrowserPage) -> None:
     values = [float(k) for k in range(1, 101)]
     script = (

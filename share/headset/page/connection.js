@@ -177,7 +177,6 @@ export class Connection {
         this.#waitMs = FIRST_WAIT_MS;
         this.text = "connected";
         this.#others.postMessage(welcome.session);
-        this.clock.forget();
         for (let k = 0; k < FIRST_PINGS; k++) this.#timers.push(setTimeout(() => this.#ping(), 60 * k));
         for (const message of this.#pending.values()) this.#send(message);
     }

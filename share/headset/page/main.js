@@ -145,6 +145,7 @@ class App {
         if (timeMs === null || pose.map_id === null) return;
         this.placement.addPose({
             timeMs,
+            timeSigmaMs: this.connection.clock.sigmaMs,
             cov: poseCov(pose.sigma_m, pose.sigma_rad),
             mapId: pose.map_id,
             T_map_body: Float64Array.from(this.room.agents.get(pose.agent).T),

@@ -26,6 +26,13 @@ export function easeLeft(sinceMs) {
     return 1 - s * s * (3 - 2 * s);
 }
 
+// The covariance (6, 6) of a pose whose time is known by so much, of a head that moves at {radPerS, mPerS}.
+function covAtTime(cov, { radPerS, mPerS }, timeSigmaMs) {
+    const out = Float64Array.from(cov);
+    for (let i = 0; i < 6; i++) out[7 * i] += (((i < 3 ? radPerS : mPerS) * timeSigmaMs) / 1000) ** 2;
+    return out;
+}
+
 export class Placement {
     mode = "align";  // as the wearer wants it
     isFollowing = false;  // as it is drawn
@@ -77,7 +84,7 @@ export class Placement {
         return `poses ${this.poseAgeMs(nowMs) > MAX_AGE_MS ? "are" : "were"} over 1 s old`;
     }
 
-    // A pose of the own device; timeMs: of its stamp on the page's clock.
+    // A pose of the own device; timeMs: of its stamp on the page's clock, timeSigmaMs: of that.
     addPose(pose) {
         this.#pose = { ...pose, timeMs: pose.timeMs - this.timeshiftMs };
         this.#waiting.push(this.#pose);
@@ -159,7 +166,8 @@ export class Placement {
             const pose = this.#waiting.shift();
             const T_local_viewer = this.history.at(pose.timeMs);
             if (T_local_viewer === null) continue;
-            const { mapId, T_map_body, cov } = pose;
+            const { mapId, T_map_body } = pose;
+            const cov = covAtTime(pose.cov, this.history.speedsAt(pose.timeMs), pose.timeSigmaMs ?? 0);
             const pair = { timeS: pose.timeMs / 1000, mapId, T_map_body, cov, T_local_viewer };
             const [alignment, outcome] = this.alignment.after(pair);
             this.alignment = alignment;
