@@ -211,7 +211,10 @@ def test_a_clock_is_kept_until_a_sample_contradicts_it(modules: BrowserPage) -> 
         "clock",
         """(() => {
             const clock = new m.ServerClock(), said = [];
-            const add = (...sample) => { clock.add(...sample); said.push([clock.toPage(6000), clock.sigmaMs]); };
+            const add = (...sample) => {
+                clock.add(...sample);
+                said.push([clock.toPage(6000), clock.sigmaMs]);
+            };
             add(200, 5202, 204);  // 5000 ahead
             add(900, 6300, 1300);  // within its bounds: 200 more or less
             add(2000, 9000, 2012);  // 6994 ahead: the server's machine has started anew
