@@ -29,10 +29,11 @@ from share.odometry.health import (
 from share.odometry.imu_predictor import ImuPredictor, ImuStatus, mean_angular_rate
 from share.odometry.keyframes import KeyframeWork
 from share.odometry.landmarks import LandmarkMap
+from share.odometry.levelling import level
 from share.odometry.mono_initialisation import MonoWindow, start_mono_window
 from share.odometry.relocalisation import LocalMap
 from share.odometry.rest_detection import RestDetector
-from share.odometry.state import FilterState, move, twist
+from share.odometry.state import FilterState, move, pose_at_stamp
 from share.odometry.tilt_realignment import TiltRealignment
 from share.odometry.track_result import TrackResult, finite_median
 from share.types import (
@@ -58,12 +59,7 @@ _MAX_UP_SIGMA_RAD = np.radians(3.0)  # tilt sigma up to which the up direction i
 class InertialTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        config: InertialConfig,
-        bias: ImuBias | None = None,
-    ) -> None:
+    def __init__(self, rig: Rig, config: InertialConfig, bias: ImuBias | None = None) -> None:
         """bias: of the IMU, as estimated by an earlier run. Raises ValueError without an IMU."""
         if rig.imu is None:
             raise ValueError("the rig has no IMU; use VisualTracker")
@@ -79,9 +75,9 @@ class InertialTracker:
         self._divergence = DivergenceMonitor()
         self._consistency = ImageImuConsistency()
         self._imu_wait_frames = 0  # without an IMU sample
-        self._start_ns = 0
-        self._has_published = False
-        self._knows_up = False  # the state began with IMU samples
+        self._start_ns, self._has_published = 0, False
+        self._knows_up = False  # the state began with IMU samples, or was levelled by some
+        self._odom_is_level = False  # so was some state of this segment
         self._new_segment = False  # the next keyframe begins a segment
         self._keyframes = KeyframeWork(config)
         self._realignment = TiltRealignment()
@@ -252,12 +248,15 @@ class InertialTracker:
         self._rest = RestDetector()
         self._new_segment = new_segment
         if new_segment:
-            self._local_map = LocalMap()
+            self._local_map, self._odom_is_level = LocalMap(), self._knows_up
+        self._knows_up = self._knows_up and self._odom_is_level
 
     # A frame with a state
 
     def _track_frame(self, frame: Frame, last_frame: Frame, landmarks: LandmarkMap) -> TrackResult:
         s, T_before, interval_ns = landmarks.state, landmarks.state.T, frame.stamp_ns - last_frame.stamp_ns
+        if not self._odom_is_level and self._mono_window is None:
+            self._level(s)
         imu = self._predict(frame, s)
         matches = landmarks.match_features(frame, last_frame.image0, interval_ns * 1e-9)
         visual_update.mark_dynamic(landmarks, matches, self._rig.cam0, self._imu.rate)
@@ -287,7 +286,16 @@ class InertialTracker:
     def _predict(self, frame: Frame, s: FilterState) -> ImuStatus:
         """Propagate the state to the time of the frame's image."""
         image_ns = frame.stamp_ns + round(s.timeshift_s * 1e9)  # IMU time
-        return self._imu.predict(s, image_ns, gyro_only=self._mono_window is not None)
+        gyro_only = self._mono_window is not None or not self._odom_is_level
+        return self._imu.predict(s, image_ns, gyro_only)
+
+    def _level(self, s: FilterState) -> None:
+        """Learn which way is up, of a state that began without IMU, once samples come."""
+        T_new_old = level(s, self._imu.buffer.samples, self._bias, self._config.gravity)
+        if T_new_old is not None:
+            self._knows_up, self._odom_is_level, self._rest = True, True, RestDetector()
+            self._local_map.turn(T_new_old)
+            self._keyframes.turn(T_new_old)
 
     def _update(
         self, landmarks: LandmarkMap, matches: FeatureMatches, interval_ns: int
@@ -321,7 +329,7 @@ class InertialTracker:
         if window is None or not (is_keyframe or window.wants_frame(s.stamp_ns)):
             return False
         imu = self._imu.samples(window.last_ns, s.stamp_ns)
-        if imu is None or window.is_full or measures_depth(frame, self._rig):
+        if imu is None or not self._odom_is_level or window.is_full or measures_depth(frame, self._rig):
             self._landmarks = self._mono_window = None  # start again
             return False
         return window.try_solve(landmarks, imu, is_keyframe) and initialisation.has_converged(s)
@@ -336,7 +344,8 @@ class InertialTracker:
             self._realignment.start(s, new_segment)
         else:
             self._realignment.update(s)
-        pose, cov = self._published_pose(s), filter.motion_cov_since_origin(s)
+        pose = self._realignment.published_pose(pose_at_stamp(s, self._imu.rate))
+        cov = filter.motion_cov_since_origin(s)
         if self._start_cov is not None:
             cov = se3.compose_cov(se3.inverse(s.T_origin) @ s.T, self._start_cov, cov)
         if wants_keyframe or is_first:
@@ -357,7 +366,7 @@ class InertialTracker:
         )
 
     def _track_state(self, s: FilterState, count: int, imu: ImuStatus) -> TrackState:
-        has_imu = imu.has_samples and not (imu.has_rejected and self._has_published)
+        has_imu = imu.has_samples and self._odom_is_level and not (imu.has_rejected and self._has_published)
         if self._mono_window is not None or (
             has_imu and not self._has_published and not self._is_publishable(s, count)
         ):
@@ -380,13 +389,6 @@ class InertialTracker:
         else:
             reason = initialisation.waiting_for(s) if self._sees_the_room(count) else WaitReason.VIEW
         return TrackResult(TrackState.INITIALISING, None, waiting_for=reason)
-
-    def _published_pose(self, s: FilterState) -> F64:
-        """Return the pose at the frame's stamp, IMU time; the state is at the time of the image."""
-        if s.timeshift_s == 0:
-            return self._realignment.published_pose(s.T)
-        T_odom_body = se3.exp(-twist(s, self._imu.rate) * s.timeshift_s) @ s.T
-        return self._realignment.published_pose(T_odom_body)
 
     def _declare_lost(self, frame: Frame) -> TrackResult:
         """Discard the filter."""

@@ -30,7 +30,7 @@ MIN_IMU_S = 0.05  # of IMU samples
 _MAX_AGE_S = 0.1  # of the newest sample: an older one says nothing about the state now
 _MIN_FORCE = 1.0  # m/s^2; in free fall, or of a dead accelerometer, a force does not show which way is up
 _AVERAGING_S = 0.5
-_UNKNOWN_TILT_RAD = 1.0
+UNKNOWN_TILT_RAD = 1.0
 _GAUGE_SIGMA = 1e-4  # rad, m: of position and heading, which define odom
 _STILL_SPEED_SIGMA = 0.1  # m/s, of a body at rest
 _MOVING_SPEED_SIGMA = 1.0  # m/s, of a body in motion
@@ -52,14 +52,11 @@ def state_from_imu(
 
     bias: as known before; it is ignored where samples at rest contradict it.
     """
-    if len(imu) < 2 or (imu.stamps_ns[-1] - imu.stamps_ns[0]) < MIN_IMU_S * 1e9:
-        return None
-    if imu.stamps_ns[-1] < stamp_ns + rig.timeshift_ns - _MAX_AGE_S * 1e9:
+    force = mean_force(stamp_ns + rig.timeshift_ns, imu)
+    if force is None:
         return None
     recent = _recent(imu)
-    force, rate = recent.accel.mean(axis=0), recent.gyro.mean(axis=0)
-    if np.linalg.norm(force) < _MIN_FORCE:
-        return None
+    rate = recent.gyro.mean(axis=0)
     is_still = _is_still(recent.gyro, recent.accel)
     if rest_contradicts(bias, imu, config):
         bias = unknown_bias(config)
@@ -71,8 +68,20 @@ def state_from_imu(
     return state
 
 
+def mean_force(now_ns: int, imu: ImuBatch) -> F64 | None:
+    """Return the mean force (3,) of the newest samples; None with too few, with none of late, or where it
+    does not show which way is up."""
+    if len(imu) < 2 or (imu.stamps_ns[-1] - imu.stamps_ns[0]) < MIN_IMU_S * 1e9:
+        return None
+    if imu.stamps_ns[-1] < now_ns - _MAX_AGE_S * 1e9:
+        return None
+    force: F64 = _recent(imu).accel.mean(axis=0)
+    return None if np.linalg.norm(force) < _MIN_FORCE else force
+
+
 def state_from_camera(stamp_ns: int, rig: Rig, bias: ImuBias) -> FilterState:
-    """Return a state for a body without IMU samples: up is the top of the image."""
+    """Return a state for a body without IMU samples: up is the top of the image, until samples come (see
+    `levelling`)."""
     up = rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
     T = align_to_gravity(up, rig.T_body_cam0[:3, 2])
     sigma = _initial_sigmas(False, bias)
@@ -119,7 +128,7 @@ def rest_contradicts(bias: ImuBias, imu: ImuBatch, config: InertialConfig) -> bo
 
 def _initial_sigmas(is_still: bool, bias: ImuBias) -> F64:
     out = np.zeros(CORE_SIZE)
-    out[0:2], out[2:6] = _UNKNOWN_TILT_RAD, _GAUGE_SIGMA
+    out[0:2], out[2:6] = UNKNOWN_TILT_RAD, _GAUGE_SIGMA
     out[VELOCITY] = _STILL_SPEED_SIGMA if is_still else _MOVING_SPEED_SIGMA
     out[GYRO_BIAS], out[ACCEL_BIAS] = bias.gyro_sigma, bias.accel_sigma
     out[EXTRINSIC][:3], out[EXTRINSIC][3:] = EXTRINSIC_SIGMA_RAD, EXTRINSIC_SIGMA_M
@@ -134,6 +143,11 @@ def _update_with_force(state: FilterState, force: F64, sigma: float, g: float) -
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, ACCEL_BIAS] = Rt @ se3.hat(z), np.eye(3)
     filter.isotropic_update(state, force - Rt @ z - state.ba, H, sigma)
+
+
+def update_with_force_in_motion(state: FilterState, force: F64, g: float) -> None:
+    """Update with the mean force (3,) of samples of a body that may be in motion."""
+    _update_with_force(state, force, _MOVING_FORCE_SIGMA, g)
 
 
 def _update_with_rate(state: FilterState, rate: F64) -> None:

@@ -74,6 +74,10 @@ class LastPublishedKeyframe:
         self.keyframe_id = keyframe_id
         self._T_odom_body = s.keyframe_poses[filter.keyframe_index(s, keyframe_id)]
 
+    def turn(self, T_new_old: F64) -> None:
+        """Give its pose in another odom."""
+        self._T_odom_body = T_new_old @ self._T_odom_body
+
     def motion_to(self, s: FilterState, k: int, new_segment: bool) -> tuple[F64, F64]:
         """Return T_last_body (4, 4) of keyframe k and its covariance (6, 6), by the present state.
 
@@ -248,6 +252,11 @@ class KeyframeWork:
     def _slice_count(self, frame: Frame) -> int:
         """Return the number of slices that there is time for after the frame just tracked."""
         return int((frame.stamp_ns - self._processed_ns) // _SLICE_PERIOD_NS)
+
+    def turn(self, T_new_old: F64) -> None:
+        """Give the poses of earlier keyframes in another odom."""
+        self._spacing.T = T_new_old @ self._spacing.T
+        self._last_published.turn(T_new_old)
 
     def reset(self) -> None:
         """Drop all pending work: the filter begins anew, with new keyframe ids."""

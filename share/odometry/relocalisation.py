@@ -160,6 +160,12 @@ class LocalMap:
         self.anchor_px = np.concatenate([self.anchor_px, px.astype(np.float32)])
         return ids
 
+    def turn(self, T_new_old: F64) -> None:
+        """Give all in another odom."""
+        self.points = self.points @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+        for keyframe in self.keyframes.values():
+            keyframe.T_odom_cam = T_new_old @ keyframe.T_odom_cam
+
     def row_indices(self, ids: I64) -> I64:
         """Return the row of each point, -1 where it was dropped."""
         row = np.searchsorted(self.ids, ids)

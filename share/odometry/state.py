@@ -145,6 +145,15 @@ def twist(state: FilterState, rate: F64) -> F64:
     return np.concatenate([turning, state.v - (b * z - c * y, c * x - a * z, a * y - b * x)])
 
 
+def pose_at_stamp(state: FilterState, rate: F64) -> F64:
+    """Return T_odom_body (4, 4) at the frame's stamp, IMU time; the state is at the time of the image. rate
+    (3,): rad/s, body."""
+    if state.timeshift_s == 0:
+        return state.T
+    out: F64 = se3.exp(-twist(state, rate) * state.timeshift_s) @ state.T
+    return out
+
+
 # Add keyframes and features to the state, and marginalise them. Each function changes the state in place.
 # Source: stochastic cloning with an unknown time offset, Li & Mourikis (2014).
 
