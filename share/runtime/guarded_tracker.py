@@ -25,8 +25,9 @@ class GuardedTracker:
 
     def __init__(self, rig: Rig, config: Config, guard: FaultGuard, bias: ImuBias | None = None) -> None:
         """bias: initial bias of the IMU, None if unknown."""
-        self._make_tracker = partial(make_tracker, rig, config, bias)
-        self._tracker, self._guard = self._make_tracker(), guard
+        self._make_tracker = partial(make_tracker, rig, config)
+        self._tracker, self._guard = self._make_tracker(bias), guard
+        self._initial_bias, self._dropped_before = bias, False  # dropped by an earlier tracker
         self._timeshift_ns = rig.timeshift_ns
         self.bias: ImuBias | None = None  # newest estimate at a keyframe
         self._had_pose = False  # since the last failure
@@ -96,7 +97,8 @@ class GuardedTracker:
     @property
     def has_dropped_bias(self) -> bool:
         """Whether the initial bias is not used, because a body at rest contradicts it."""
-        return isinstance(self._tracker, InertialTracker) and self._tracker.has_dropped_bias
+        is_dropped = isinstance(self._tracker, InertialTracker) and self._tracker.has_dropped_bias
+        return self._dropped_before or is_dropped
 
     def _recover(self, frame: Frame) -> None:
         had_pose, self._had_pose = self._had_pose, False
@@ -107,4 +109,5 @@ class GuardedTracker:
         except Exception as error:
             self._guard.record("resetting the tracker", error)
         self._rejected_before += self._tracker.rejected_imu_samples
-        self._tracker = self._make_tracker()
+        self._dropped_before = self.has_dropped_bias
+        self._tracker = self._make_tracker(None if self._dropped_before else self._initial_bias)

@@ -119,6 +119,25 @@ def test_the_bias_outlives_a_replaced_tracker(walk: rig_fuzzer.Walk, monkeypatch
     assert biases == [None, learnt, learnt]
 
 
+def test_a_dropped_bias_stays_dropped_in_a_replaced_tracker(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known, given = ImuBias([0.01, 0.0, 0.0], [0.1, 0.2, 0.3], 1e-3, 1e-2), []
+    make = guarded_tracker.make_tracker
+
+    def recorded(rig: Rig, config: Config, bias: ImuBias | None) -> object:
+        given.append(bias)
+        return make(rig, config, bias)
+
+    monkeypatch.setattr(guarded_tracker, "make_tracker", recorded)
+    tracker = GuardedTracker(RIG, Config(), FaultGuard(lambda text: None), known)
+    for dropped in (False, True, False):  # by the tracker that is replaced
+        monkeypatch.setattr(tracker._tracker, "has_dropped_bias", dropped)
+        tracker.attempt("a step before the first pose", walk.frames[0], _no_gain)
+    assert given == [known, known, None, None]
+    assert tracker.has_dropped_bias
+
+
 @pytest.mark.parametrize("dropped", [False, True])
 def test_a_bias_that_the_tracker_drops_is_told_to_its_store(
     walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dropped: bool
