@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LONG_INIT_S = 1.0  # a first pose later than this is reported
 _UNCERTAIN = {  # states of poses that are less certain
     "WEAK": "few features",
-    "INERTIAL_ONLY": "IMU alone (no feature accepted)",
+    "INERTIAL_ONLY": "IMU alone (fewer than 6 features accepted)",
     "VISION_ONLY": "images alone (no IMU)",
 }
 

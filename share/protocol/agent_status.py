@@ -18,7 +18,7 @@ _MIN_CHANGE_S = 0.1  # least time between two reports of a change
 _STATE_TEXTS = {
     TrackState.WEAK: "few features in view",
     TrackState.VISION_ONLY: "no IMU sample for {:.1f} s",
-    TrackState.INERTIAL_ONLY: "no feature accepted for {:.1f} s",
+    TrackState.INERTIAL_ONLY: "fewer than 6 features accepted for {:.1f} s",
     TrackState.LOST: "lost for {:.1f} s",
 }
 

@@ -8,6 +8,7 @@ import pytest
 
 from share.cli.track import _summary
 from share.metrics.frame_log import RunLog
+from share.odometry.health import MIN_POSE_FEATURES
 from share.types import TrackState
 
 
@@ -26,7 +27,8 @@ def report(*states: TrackState) -> dict[str, Any]:
         ([TrackState.OK, TrackState.LOST], None),
         (
             [TrackState.WEAK, TrackState.INERTIAL_ONLY, TrackState.OK, TrackState.INERTIAL_ONLY],
-            "of the frames with a pose: few features in 1, IMU alone (no feature accepted) in 2",
+            "of the frames with a pose: few features in 1, "
+            f"IMU alone (fewer than {MIN_POSE_FEATURES} features accepted) in 2",
         ),
         ([TrackState.OK, TrackState.VISION_ONLY], "of the frames with a pose: images alone (no IMU) in 1"),
     ],

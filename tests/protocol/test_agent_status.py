@@ -8,6 +8,7 @@ from dataclasses import replace
 from helpers.model_edge import HELLO, MS, S, tracked
 
 from share.config import Config
+from share.odometry.health import MIN_POSE_FEATURES
 from share.protocol import agent_events as ev
 from share.protocol.agent import AgentProtocol
 from share.protocol.common_events import EdgeMessageReceived, SendToEdge
@@ -118,6 +119,7 @@ def test_each_state_has_its_reason() -> None:
     for state, waits, reason in (
         (TrackState.INITIALISING, WaitReason.IMU, "waiting for the IMU's first samples"),
         (TrackState.VISION_ONLY, None, "no IMU sample for 0.2 s"),
+        (TrackState.INERTIAL_ONLY, None, f"fewer than {MIN_POSE_FEATURES} features accepted for 0.2 s"),
         (TrackState.LOST, None, "lost for 0.2 s"),
         (TrackState.WEAK, None, "few features in view"),
     ):
