@@ -74,7 +74,7 @@ def test_what_the_loop_asks_for_was_fetched_when_the_file_was_opened(tmp_path: P
 
 
 def test_a_file_that_could_not_be_read_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The room waited for ever: the error was remembered until a write, and a room that waits writes nothing."""
+    """The room waited for ever: the error was kept until a write, and a room that waits writes nothing."""
     _, room = opened(tmp_path / "room.sqlite", small_map())
     room.store.write([keyframe(ANN, 20)])
     with monkeypatch.context() as patch:

@@ -197,9 +197,7 @@ def test_short_memory_for_a_message_is_the_death_of_the_process(message: Any, re
     worker.close()
 
 
-@pytest.mark.parametrize(
-    "error", [RuntimeError("can't start new thread"), MemoryError(), OSError(12, "none")]
-)
+@pytest.mark.parametrize("error", [RuntimeError("no thread"), MemoryError(), OSError(12, "no memory")])
 def test_a_process_that_cannot_be_started_later_is_dead(
     monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
