@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from share.errors import brief_reason
 from share.mapping.map_changes import StoredMap
 from share.runtime.room_parts import RoomStore
 from share.store.salvage import ReadRows
@@ -38,12 +39,23 @@ class MapReading:
     RuntimeError where no thread can be started."""
 
     def __init__(self, store: RoomStore, on_read: Callable[[MapRead], None]) -> None:
-        self._thread = threading.Thread(
-            target=lambda: on_read(read_map(store)), name="map reading", daemon=True
-        )
+        self._store, self._on_read = store, on_read
+        self._read: MapRead | None = None
+        self._thread = threading.Thread(target=self._run, name="map reading", daemon=True)
         self._thread.start()
 
-    def wait(self, timeout_s: float) -> bool:
-        """Wait for the end. Return False if that takes longer than `timeout_s`."""
+    def end(self, timeout_s: float, notify: Callable[[str], None]) -> str:
+        """Wait for the end, notify of problems that were found, and close the file; abandon it where that
+        takes longer than `timeout_s`. Return why it could not be read; "" if it could."""
         self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        if (read := self._read) is None:
+            self._store.abandon()
+            return "the map file was still being read, or repaired"
+        for problem in read.new_problems:
+            notify(problem)
+        self._store.close()
+        return "" if read.error is None else brief_reason(read.error)
+
+    def _run(self) -> None:
+        self._read = read_map(self._store)
+        self._on_read(self._read)

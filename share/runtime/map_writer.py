@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from share.errors import StoreError
+from share.errors import ShareError
 from share.mapping.map_changes import SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
 from share.runtime.output_writer import JobThread
@@ -97,7 +97,7 @@ class MapWriter:
         batch = [self._pending[i] for i in range(min(max_requests, len(self._pending)))]
         try:
             self._store.write([change for keep in batch for change in keep.changes])
-        except StoreError as error:
+        except ShareError as error:
             self._notify_failure(str(error))
             return False
         except Exception as error:  # a change is faulty, not the disk: skip only that change

@@ -11,6 +11,7 @@ from typing import Any
 
 from share.errors import ShareError, StoreError, brief_reason
 from share.mapping.map_changes import SaveObject, StoredMap, with_unknown_credentials
+from share.protocol.edge import EdgeProtocol
 from share.protocol.peer import RestoredRun, restored_runs
 from share.runtime.map_reading import MapRead, read_map
 from share.runtime.mapper_process import MapperReport, RestoreMap
@@ -99,6 +100,12 @@ class MapperRestarts:
         """Record that no new session could be started. Return the seconds until the next try."""
         return self._backoff.record_failure(time.monotonic_ns())
 
+    def keep(self, state_machine: EdgeProtocol) -> None:
+        """Keep objects and forgotten runs of a session that ends now for the next one. What changes after its
+        end is not saved."""
+        self.objects = state_machine.room.kept_objects()
+        self.forgotten = state_machine.forgotten_next_keyframes()
+
     @property
     def store_to_read(self) -> RoomStore | None:
         """The map file, if the next `load_map` needs its rows."""
@@ -142,7 +149,6 @@ class MapperRestarts:
         return read.found
 
     def _set_aside(self, reason: str) -> None:
-        self._tries = 0
         if self.store is None:
             return
         if not self.store.writable:
@@ -155,6 +161,7 @@ class MapperRestarts:
                 self._copies = _copy_names(self.store.path)
             self.forgotten = self.store.outline().forgotten  # of the file too, which may not have been read
             text = f"the map file is renamed to {renamed.name}: {reason}; a new one is started"
+        self._tries = 0
         self._asides.append(text)
         self._notify(text)
 

@@ -109,7 +109,7 @@ class RemoteStore:
         return _Rows(self._described().keyframes)
 
     def _described(self) -> OpenedFile:
-        if self._opened is None:
+        if self._opened is None or isinstance(self._opened.outline, Exception):
             self._opened = opened = self._room.call("describe_map", timeout_s=_READ_S)
             self.problems = opened.problems  # it may have been repaired
         return self._opened

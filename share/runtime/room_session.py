@@ -86,6 +86,8 @@ class RoomSession:
         self._parts = parts
         self.progress = MapperProgress(start_delay_s)
         self.map_writer: MapWriter | None = None
+        self.is_ended = False
+        self.has_lost_changes = False  # since it has ended
         self._mapper: MapperLink | None = None
         self._trackers = TrackerProcesses(parts.settings, parts.post)
         self.state_machine: EdgeProtocol
@@ -157,6 +159,8 @@ class RoomSession:
                 self._trackers.execute(effect)
             case SaveChanges() if self.map_writer is not None:
                 self.map_writer.submit(effect)
+            case SaveChanges() if effect.changes:
+                self.has_lost_changes = True
 
     def record_added(self, added: KeyframesAdded) -> None:
         """Record that the mapper has added keyframes: it is given more."""
@@ -173,6 +177,7 @@ class RoomSession:
     def end(self) -> bool:
         """End the mapper as it is, and write what is left. From then on nothing is applied or saved. Return
         False, and keep the writer, where the disk does not answer."""
+        self.is_ended = True
         if self._mapper is not None:
             self._mapper.close()
             self._mapper = None

@@ -133,14 +133,14 @@ class ServedRoom:
             return self._session.map_writer.close(timeout_s)
         if not self.is_waiting:
             return None
-        store = self._restarts.store
-        if self._reading is not None and store is not None and not self._reading.wait(timeout_s):
-            store.abandon()
-            return "the disk of the map file does not answer: keyframes not acknowledged may be missing"
-        if store is not None:  # unlock it
+        reason, store = self._waiting_reason, self._restarts.store
+        if self._reading is not None:
+            reason = self._reading.end(timeout_s, lambda problem: self._post(MapNotice(problem)))
+        elif store is not None:  # unlock it
             store.close()
-        failed = self._reading is None
-        return f"{self._waiting_reason}: keyframes not acknowledged are not in it" if failed else None
+        if not reason and self._session.has_lost_changes:
+            reason = "the edge ended before a new mapper began"
+        return f"{reason}: keyframes not acknowledged are not in it" if reason else None
 
     def finish(self, incomplete_reason: str | None) -> None:
         """Acknowledge what has been saved at the end."""
@@ -208,7 +208,7 @@ class ServedRoom:
             "degraded": self._restarts.losses,
             "agent_trouble": trouble_lines(report["agents"]),
             **self._session.progress.last_solve(),
-            **self._restarts.loading(),
+            **({} if self.is_waiting else self._restarts.loading()),
         }
 
     def end_totals(self) -> SessionTotals:
@@ -256,14 +256,15 @@ class ServedRoom:
     def _restart_session(self, retry_s: float) -> None:
         """End this session, read the map, and start a new one with it. Until then nothing is applied or
         acknowledged. retry_s: pause before the next try, if this one fails."""
+        if self._reading is not None:  # a restart is under way
+            return
         self._restart_due_s, self._retry_s = time.monotonic() + retry_s, retry_s
         try:
+            if not self._session.is_ended:
+                self._restarts.keep(self._session.state_machine)
             if not self._session.end():
                 raise StoreError("the disk of the map file does not answer")
             self._discard_answers()
-            state_machine = self._session.state_machine
-            self._restarts.objects = state_machine.room.kept_objects()
-            self._restarts.forgotten = state_machine.forgotten_next_keyframes()
             if (store := self._restarts.store_to_read) is not None:
                 self._waiting_reason = f"the map file is read; {_NOTHING_YET}"
                 self._reading = MapReading(store, self._post)

@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from share import startup
-from share.errors import describe_exception
+from share.errors import brief_reason, describe_exception
 from share.spawning import SPAWN_CONTEXT
 
 Inbox = queue.SimpleQueue[Any]
@@ -84,8 +84,8 @@ class WorkerProcess:
             if not self._closing.is_set():
                 try:
                     self._process.start()
-                except OSError as error:  # no memory, too many processes
-                    self._start_error = error.strerror or str(error)
+                except (OSError, RuntimeError, MemoryError) as error:  # too many processes, or threads
+                    self._start_error = getattr(error, "strerror", None) or brief_reason(error)
             self._child_end.close()
 
     @property

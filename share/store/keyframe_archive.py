@@ -52,8 +52,8 @@ class KeyframeArchive:
         try:
             file_id = self._path.stat().st_dev, self._path.stat().st_ino
             if self._db is None or file_id != self._file_id:
-                self._file_id = file_id
-                self._db = database.open_for_reading(self._path)
+                self._db = None  # if opening fails, it is tried again
+                self._file_id, self._db = file_id, database.open_for_reading(self._path)
                 self._db.set_progress_handler(None, 0)  # each query reads one row
                 limit_untrusted(self._db, _MAX_ROW_BYTES)
             return self._db.execute(query, key).fetchone() or ()

@@ -48,15 +48,21 @@ class OpenedMap:
 
 def read_and_repair(path: Path) -> OpenedMap:
     """Read a map file before it is opened for writing; salvage it if needed."""
-    finish_salvage(path)
+    finished = finish_salvage(path)
     if not database.check_is_map(path):
         return OpenedMap(ReadRows.empty())
     try:
-        return _opened(_read_intact(path))
+        opened = _opened(_read_intact(path))
+        if finished != path:
+            opened = replace(opened, problems=(damage_text(finished), UNCOUNTED, *opened.problems))
+        return opened
     except DamageError:
         salvaged, renamed = salvage(path)
         problems = _with_problem(decode_map(salvaged), damage_text(renamed)).problems
         return OpenedMap(_read_intact(path), problems)
+
+
+UNCOUNTED = "the repair was interrupted: how much was lost was not counted"
 
 
 def damage_text(renamed: Path) -> str:

@@ -8,7 +8,7 @@ import math
 import os
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from share.store import database, rows, schema
 from share.store.changes import add_forgotten, apply_change, first_row
 from share.store.database import DamageError, is_map, why_not_written
 from share.store.loading import (
+    UNCOUNTED,
     OpenedMap,
     damage_text,
     decode_map,
@@ -172,12 +173,18 @@ class MapStore:
         """Salvage the file. Not all of it is read when it is opened, so it may be damaged unnoticed. Raises
         StoreError if the disk is full or fails; may be repeated."""
         self._close_db()
-        try:
+        with self._repairing():
             salvaged, renamed = salvage(self.path)
-        except ShareError as error:
-            raise StoreError(f"{self.path}: the file is damaged and cannot be repaired: {error}") from None
+        self._note_file()
         self.problems = (*self.problems, damage_text(renamed), *decode_map(salvaged).problems)
         self._start_writing()
+
+    @contextlib.contextmanager
+    def _repairing(self) -> Iterator[None]:
+        try:
+            yield
+        except ShareError as error:
+            raise StoreError(f"{self.path}: the file is damaged and cannot be repaired: {error}") from None
 
     def _close_db(self) -> None:
         """Close the writer's connection, until `_start_writing` or `_open_again`. Its log may go with it."""
@@ -187,12 +194,20 @@ class MapStore:
         self._file_ids.pop(wal_path(self.path), None)
         self._opened = self._outline = None
 
+    def _note_file(self) -> None:
+        """Note that the file is another one now."""
+        self._file_ids = _read_file_ids(self.path)
+        self._file_ids.pop(wal_path(self.path), None)
+
     def _open_again(self) -> None:
         """Open the writer's connection after a repair that has failed, perhaps in its last steps."""
-        if (renamed := finish_salvage(self.path)) == self.path:
+        with self._repairing():
+            renamed = finish_salvage(self.path)
+        if renamed == self.path:
             self._check_in_place()
         else:
-            self.problems = (*self.problems, damage_text(renamed))
+            self._note_file()
+            self.problems = (*self.problems, damage_text(renamed), UNCOUNTED)
         self._start_writing()
 
     def _start_writing(self) -> None:
@@ -251,6 +266,7 @@ class MapStore:
         about = self._read_rows(["about"]).tables["about"]
         self._close_db()
         renamed = set_aside(self.path)
+        self._file_ids = {}
         self._start_writing()
         with database.translate_errors(self.path, "written", writes=True), self._writable_db() as db:
             db.execute("BEGIN IMMEDIATE")

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from share.errors import StoreError
+from share.errors import ShareError, StoreError
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveLoops, SavePoses
 from share.protocol.edge_events import ChangesSaved, SaveChanges
@@ -99,12 +99,13 @@ def test_unwritten_changes_are_not_acknowledged(opened, reason):
 
 
 def test_another_reason_is_reported(opened):
-    writer, disk, _, messages = opened
-    for reason in ("full", "broken"):
-        disk.error = StoreError(reason)
+    writer, disk, tickets, messages = opened
+    for reason, kind in (("full", StoreError), ("broken", StoreError), ("a repair fails", ShareError)):
+        disk.error = kind(reason)
         writer.submit(SaveChanges(0, (change(0),)))
         until(lambda reason=reason: messages and messages[-1].startswith(reason))
-    assert len(messages) == 2
+    assert len(messages) == 3
+    assert not tickets
 
 
 def test_a_disk_that_does_not_answer_is_reported(opened, monkeypatch):

@@ -21,6 +21,7 @@ from share.mapping.corrections import MapEvent
 from share.mapping.loops import KeyframeKey
 from share.mapping.map_changes import RemoveKeyframes, RemoveRun, StoredMap
 from share.net.transport import IncomingMessage
+from share.protocol.client_service import ClientService
 from share.protocol.edge import EdgeProtocol
 from share.protocol.edge_events import (
     ChangesSaved,
@@ -537,10 +538,80 @@ def test_a_room_that_is_closed_while_its_map_is_read_waits_for_that(path, quick,
     if is_answered:
         may_read.set()
     reason = room.close_file(0.05 if not is_answered else 60.0)
-    assert ("does not answer" in (reason or "")) is not is_answered
+    assert ("still being read, or repaired" in (reason or "")) is not is_answered
     assert is_locked(path) is not is_answered
     may_read.set()
     room.finish(reason)
+
+
+def test_what_is_found_while_a_map_is_read_at_the_end_is_said(path, quick, monkeypatch):
+    started: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
+    lines: list = []
+    room._host.log_event = lambda event, text: lines.append(text)
+    may_read = threading.Event()
+
+    def found(store):
+        may_read.wait()
+        store.problems = ("3 keyframes could not be read",)
+        raise StoreError("the disk fails")
+
+    monkeypatch.setattr(MapStore, "rows", found)
+    started[0]("was ended by SIGKILL")
+    room.step()
+    room.end_processes()
+    may_read.set()
+    reason = room.close_file()
+    room.finish(reason)
+    assert reason == "the disk fails: keyframes not acknowledged are not in it"
+    assert lines[1:] == ["3 keyframes could not be read", reason]
+    assert not is_locked(path)
+
+
+def test_what_changes_while_a_room_waits_is_not_kept(path, quick, monkeypatch):
+    """It is not saved: an object that was removed then came back at the next start of the edge."""
+    started: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
+    kept = iter([["chair"], [], []])
+    monkeypatch.setattr(ClientService, "kept_objects", lambda self: next(kept))
+    rows, fails = MapStore.rows, deque([True, True, False])
+    monkeypatch.setattr(
+        MapStore, "rows", lambda store: raises(StoreError("full"))() if fails.popleft() else rows(store)
+    )
+    monkeypatch.setattr(EdgeProtocol, "__init__", noted := given_objects(EdgeProtocol.__init__))
+    started[0]("was ended by SIGKILL")
+    until(lambda: room.step() or not room.is_waiting)
+    assert noted.objects == [["chair"]]
+    room.close()
+
+
+def given_objects(init):
+    """A constructor that notes the objects which it is given."""
+
+    def made(self, *given, **named):
+        made.objects.append(given[5])
+        init(self, *given[:5], (), **named)
+
+    made.objects = []
+    return made
+
+
+def test_a_second_restart_waits_for_the_first(path, quick, monkeypatch):
+    """Two threads read one file, and a mapper outlived the room."""
+    started: list = []
+    room = serve(path, lambda on_answer, on_death, delay_s: started.append(on_death) or Process())
+    may_read, rows, readers = threading.Event(), MapStore.rows, []
+    monkeypatch.setattr(
+        MapStore, "rows", lambda store: readers.append(0) or (may_read.wait() and rows(store))
+    )
+    started[0]("was ended by SIGKILL")
+    room.step()
+    room._on_lost_effect("MemoryError")
+    room.step()
+    may_read.set()
+    until(lambda: room.step() or not room.is_waiting)
+    assert len(readers) == 1 and len(started) == 2
+    room.close()
 
 
 def test_a_change_that_is_lost_at_the_end_starts_no_mapper(path):

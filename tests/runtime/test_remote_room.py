@@ -73,6 +73,18 @@ def test_what_the_loop_asks_for_was_fetched_when_the_file_was_opened(tmp_path: P
     room.store.close()
 
 
+def test_a_file_that_could_not_be_read_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The room waited for ever: the error was kept until a write, and a room that waits writes nothing."""
+    _, room = opened(tmp_path / "room.sqlite", small_map())
+    room.store.write([keyframe(ANN, 20)])
+    with monkeypatch.context() as patch:
+        patch.setattr(MapStore, "outline", lambda store: (_ for _ in ()).throw(StoreError("disk I/O error")))
+        with pytest.raises(StoreError, match="disk I/O error"):
+            room.store.outline()
+    assert room.store.outline().next_ids[ANN] == 21
+    room.store.close()
+
+
 def test_changes_are_acknowledged_when_the_worker_has_written_them(tmp_path: Path) -> None:
     path = tmp_path / "room.sqlite"
     _, room = opened(path, small_map())

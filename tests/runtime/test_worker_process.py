@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from share.runtime import worker_process
 from share.runtime.worker_process import END, Inbox, WorkerProcess
 
 LINES = """
@@ -193,4 +194,20 @@ def test_short_memory_for_a_message_is_the_death_of_the_process(message: Any, re
     worker.send(message)
     assert died.get(timeout=60).startswith(reason)
     assert worker.is_dead
+    worker.close()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no thread"), MemoryError(), OSError(12, "no memory")])
+def test_a_process_that_cannot_be_started_later_is_dead(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """After a mapper's death the next one starts with a delay, in a thread, which ended without a word."""
+
+    def fails(process: object) -> None:
+        raise error
+
+    monkeypatch.setattr(worker_process.SPAWN_CONTEXT.Process, "start", fails)
+    died: queue.SimpleQueue[str] = queue.SimpleQueue()
+    worker = WorkerProcess("echoes", echoes, (), lambda answer: None, died.put, 0.01)
+    assert died.get(timeout=60).startswith("could not be started: ")
     worker.close()

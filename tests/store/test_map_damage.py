@@ -339,8 +339,44 @@ def test_a_repair_that_ended_in_its_last_step_is_finished_and_said(large, monkey
         patch.setattr(salvage, "finish_salvage", interrupted)
         with pytest.raises(StoreError, match="it fails"):
             store.rows()
+        patch.setattr(map_store, "finish_salvage", interrupted)
+        with pytest.raises(StoreError, match="it fails"):  # of another error, the writer loses the change
+            store.write([keyframe(ANN, 301)])
     assert not store.rows().is_damaged
     assert store.problems[0].startswith("the file was damaged; it is kept as room.sqlite.damaged-1")
+    assert store.problems[1] == "the repair was interrupted: how much was lost was not counted"
+
+
+def test_a_repaired_file_that_cannot_be_opened_at_once_is_opened_later(large, monkeypatch):
+    """It was "replaced while the edge ran; put it back", for ever."""
+    store, path = large
+    overwrite_pages(path, range(40, 90, 3))
+
+    def too_many_files(*_):
+        raise StoreError("too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(map_store, "open_writer", too_many_files)
+        for _ in range(2):
+            with pytest.raises(StoreError, match="too many open files"):
+                store.rows()
+    assert not store.rows().is_damaged
+    store.write([keyframe(ANN, 301)])
+
+
+def test_a_repair_that_is_finished_at_the_next_start_is_said(large, monkeypatch):
+    store, path = large
+    overwrite_pages(path, range(40, 90, 3))
+    with monkeypatch.context() as patch:
+        patch.setattr(salvage, "finish_salvage", lambda path: (_ for _ in ()).throw(ShareError("it fails")))
+        with pytest.raises(StoreError, match="it fails"):
+            store.rows()
+    store.close()
+    with MapStore.open(path) as again:
+        assert again.problems[:2] == (
+            "the file was damaged; it is kept as room.sqlite.damaged-1, and its intact rows were taken over",
+            "the repair was interrupted: how much was lost was not counted",
+        )
 
 
 def test_a_file_that_is_removed_after_a_repair_has_failed_is_missed(large, monkeypatch):
