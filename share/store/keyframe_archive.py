@@ -50,7 +50,8 @@ class KeyframeArchive:
     def _query(self, query: str, key: KeyframeKey) -> tuple[Any, ...]:
         """The first row; () without one, and where the file cannot be read."""
         try:
-            file_id = self._path.stat().st_dev, self._path.stat().st_ino
+            status = self._path.stat()
+            file_id = status.st_dev, status.st_ino
             if self._db is None or file_id != self._file_id:
                 self._db = None  # if opening fails, it is tried again
                 self._file_id, self._db = file_id, database.open_for_reading(self._path)
